@@ -24,7 +24,9 @@ OWN = (
 MOST = 64
 # Readings are smoothed from this number on, and as far as their white noise exceeds this share of their range; of more
 # than `MOST_READINGS` the means of equal numbers are taken.
-FEWEST_READINGS, NOISY, MOST_READINGS = 12, 2e-3, 1500
+FEWEST_READINGS, NOISY, MOST_READINGS = 12, 2e-3, 700
+# What smoothing takes away is noise if its rms is at most this multiple of that.
+IS_NOISE = 1.3
 # Ratio of the median magnitude of second differences of white noise to its standard deviation.
 SECOND_DIFFERENCES = 0.6745 * 6.0**0.5
 
@@ -131,14 +133,14 @@ def _smoothed(t: FloatArray, value: FloatArray) -> Course:
     from scipy.interpolate import make_smoothing_spline
 
     each = -(-t.size // MOST_READINGS)
-    if each > 1:
-        whole = t.size // each * each
-        t, value = (x[:whole].reshape(-1, each).mean(axis=1) for x in (t, value))
+    whole = t.size // each * each
+    at, means = (x[:whole].reshape(-1, each).mean(axis=1) for x in (t, value))
     # The weight of the roughness is chosen by generalised cross-validation, in units of the readings' interval.
-    x = (t - t[0]) / float(np.median(np.diff(t)))
-    scale = float(np.std(value)) or 1.0
-    smooth = make_smoothing_spline(x, (value - value.mean()) / scale)(x)
-    return t, value.mean() + scale * np.asarray(smooth, dtype=np.float64)
+    x, scale = (at - at[0]) / float(np.median(np.diff(at))), float(np.std(means)) or 1.0
+    smooth = means.mean() + scale * make_smoothing_spline(x, (means - means.mean()) / scale)(x)
+    # A load that is put on and taken off has corners, which are no noise.
+    taken = value - np.interp(t, at, smooth)
+    return (at, smooth) if np.std(taken) <= IS_NOISE * noise else (t, value)
 
 
 def named_in(surroundings: Mapping[str, Course], wanted: Sequence[str]) -> dict[str, Course]:

@@ -15,19 +15,18 @@ LOADED, RAMP, LOADS = (8.0, 90.0), 0.4, 4000
 
 
 @dataclass(frozen=True)
-class _Wave:
-    """Sinusoid: amplitude, angular frequency (rad/s) and phase (rad)."""
+class _Waves:
+    """Sum of sinusoids with amplitudes, angular frequencies (rad/s) and phases (rad), shape (k,) each."""
 
-    amplitude: float
-    omega: float
-    phase: float
+    amplitude: FloatArray
+    omega: FloatArray
+    phase: FloatArray
 
-    def at(self, t: FloatArray, lag: float) -> FloatArray:
+    def at(self, t: FloatArray, lag: float = 0.0) -> FloatArray:
         """Return it after a first-order lag (s), in steady state, shape (N,)."""
         late = self.omega * lag
-        return np.asarray(
-            self.amplitude / math.hypot(1.0, late) * np.sin(self.omega * t + self.phase - math.atan(late))
-        )
+        waves = np.sin(np.multiply.outer(t, self.omega) + (self.phase - np.arctan(late)))
+        return np.asarray(waves @ (self.amplitude / np.hypot(1.0, late)))
 
 
 class Room:
@@ -51,15 +50,15 @@ class Room:
 
     def temperature(self, t: FloatArray, lag: float = 0.0) -> FloatArray:
         """Return the temperature (°C), shape (N,), at times `t` (s), of something that follows it with a lag (s)."""
-        return self.mean + self._swing * _sum(self._temperature, t, lag)
+        return self.mean + self._swing * self._temperature.at(t, lag)
 
     def humidity(self, t: FloatArray) -> FloatArray:
         """Return the relative humidity (0..1), shape (N,)."""
-        return 0.45 + 0.03 * _sum(self._humidity, t, 0.0)
+        return 0.45 + 0.03 * self._humidity.at(t)
 
     def pressure(self, t: FloatArray) -> FloatArray:
         """Return the air pressure (Pa), shape (N,)."""
-        return 98_000.0 + 150.0 * _sum(self._pressure, t, 0.0)
+        return 98_000.0 + 150.0 * self._pressure.at(t)
 
     def load(self, t: FloatArray) -> FloatArray:
         """Return the load (N), shape (N,), at times `t` (s)."""
@@ -71,7 +70,7 @@ class Room:
         return np.asarray(before + share * (self._loads[place] - before))
 
 
-def _waves(rng: np.random.Generator, *, cooling: bool) -> list[_Wave]:
+def _waves(rng: np.random.Generator, *, cooling: bool) -> _Waves:
     """Return waves with a total rms of 1: slow ones, larger the slower they are, and those of an air conditioning."""
     periods = np.exp(rng.uniform(math.log(SLOW[0]), math.log(SLOW[1]), WAVES))
     sizes = (periods / SLOW[1]) ** 0.5
@@ -81,12 +80,7 @@ def _waves(rng: np.random.Generator, *, cooling: bool) -> list[_Wave]:
         sizes = np.concatenate([sizes, rng.uniform(0.5, 1.5) / np.arange(1, HARMONICS + 1) ** 2])
     sizes *= math.sqrt(2.0) / np.linalg.norm(sizes)
     phases = rng.uniform(0.0, 2 * math.pi, periods.size)
-    triples = zip(sizes.tolist(), (2 * math.pi / periods).tolist(), phases.tolist(), strict=True)
-    return [_Wave(*each) for each in triples]
-
-
-def _sum(waves: list[_Wave], t: FloatArray, lag: float) -> FloatArray:
-    return sum((wave.at(t, lag) for wave in waves), np.zeros_like(t))
+    return _Waves(sizes, 2 * math.pi / periods, phases)
 
 
 class Still(Room):

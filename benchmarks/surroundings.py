@@ -20,12 +20,13 @@ import numpy as np
 
 import slpi_ros
 from slpi_ros.io.record import Record
+from slpi_ros.model.limits import Limits, decaying_turns
 from slpi_ros.simulation.axis import SimulatedAxis
 from slpi_ros.simulation.character import Character
 from slpi_ros.simulation.parameters import AxisParameters
 from slpi_ros.simulation.room import Room, RoomSensor, Still
 
-SECONDS, RATE, LATER = 1800.0, 20.0, 86_400.0
+SECONDS, RATE, LATER, RESTS = 1800.0, 20.0, 86_400.0, 900.0
 KINDS = ("temperature zero", "temperature zero, late", "temperature sensitivity", "load zero", "load sensitivity")
 DECOYS = ("drift", "sensitivity drifts", "random walk", "nothing")
 # Least and largest effect over the record, shares of the stroke.
@@ -153,30 +154,31 @@ def run(case: tuple[int, str, bool]) -> Outcome:
 
 def later_day(parameters, character, room, own, model) -> tuple[float, float]:
     """Return the drift (m rms) of a stage on a later day, without and with its surroundings compensated."""
-    t = np.arange(0.0, 900.0, 1.0 / RATE)
+    # Before, the stage rests for a while, as it does between a start in the morning and the first path.
+    moves = np.arange(0.0, 900.0, 1.0 / RATE)
+    t = np.concatenate([np.arange(-RESTS, 0.0, 1.0), moves])
     low, high = model.axes["x"].displacement_range
     rng = np.random.default_rng(own["/load"].seed)
-    desired = low + (high - low) * (0.1 + 0.8 * path(rng, t) / 100.0)
-    beside = courses(room, own, LATER, LATER + 900.0)
+    way = path(rng, moves)
+    desired = low + (high - low) * (0.1 + 0.8 * np.concatenate([np.full(t.size - way.size, way[0]), way]) / 100.0)
+    beside = courses(room, own, LATER - RESTS, LATER + 900.0)
     quiet = replace(parameters, noise_rms=0.0, quantisation=0.0)
-
-    reference = {
-        one.topic: one.reference
-        for one in next(one for one in model.axes["x"].effects if one.name == "surroundings").quantities
-    }
+    effect = next(one for one in model.axes["x"].effects if one.name == "surroundings")
+    reference = {one.topic: one.reference for one in effect.quantities}
     still = Still(reference.get("/room/temperature", room.mean), reference.get("/load", 0.0))
 
     def stage(voltage: np.ndarray, own_room: Room) -> np.ndarray:
         axis = SimulatedAxis(quiet, 0, character, own_room)
-        # To the state in which the model starts: a full loop before.
-        lead = np.concatenate([np.linspace(0, 100, 50), np.linspace(100, 0, 50)])
-        times = LATER + np.concatenate([np.linspace(-20.0, -1.0, lead.size), t])
-        return axis.run(times, np.concatenate([lead, voltage]))[0][lead.size :]
+        # To the state in which the model starts: a decaying oscillation over its range.
+        turns = decaying_turns(Limits(0.0, 100.0), 0.0, 10)
+        lead = np.interp(np.arange(0.0, len(turns) - 0.95, 0.05), np.arange(len(turns)), turns)
+        times = LATER - RESTS + np.concatenate([np.linspace(-20.0, -1.0, lead.size), t + RESTS])
+        return axis.run(times, np.concatenate([lead, voltage]))[0][-moves.size :]
 
     def driven(with_surroundings: bool) -> np.ndarray:
         step, out = model.stream("x", start_memory="wiped"), np.empty(t.size)
         waiting = sorted(
-            (at, key, value) for key, course in beside.items() for at, value in zip(*course, strict=True)
+            (at - RESTS, key, value) for key, course in beside.items() for at, value in zip(*course, strict=True)
         ) if with_surroundings else []  # fmt: skip
         place = 0
         for k, now in enumerate(t.tolist()):
@@ -184,7 +186,7 @@ def later_day(parameters, character, room, own, model) -> tuple[float, float]:
             while place < len(waiting) and waiting[place][0] <= now:
                 told[waiting[place][1]] = waiting[place][2]
                 place += 1
-            out[k] = step(now, desired[k], told) if told else step(now, desired[k])
+            out[k] = step(now, desired[k], told)
         return out
 
     plain = driven(False)

@@ -463,7 +463,7 @@ def _extended(model: AxisModel, now: Explanation, source: str) -> AxisModel:
         voltage_range=(float(voltage.min()), float(voltage.max())),
         displacement_range=(float(y.min()), float(y.max())),
         effects=tuple(
-            effect.started(now.began[effect.name], len(evidence.parts))
+            effect.started(now.began[effect.name], len(evidence.parts)).averaged(evidence.averagings)
             for effect in now.with_uncertainty()
             if not isinstance(effect, EachRecord)
         ),

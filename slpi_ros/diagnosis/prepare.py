@@ -23,7 +23,7 @@ from slpi_ros.identification.refit import basis_of
 from slpi_ros.identification.samples import Samples, select_samples
 from slpi_ros.identification.signal_statistics import digit
 from slpi_ros.io.record import Record
-from slpi_ros.io.surroundings import clean, smoothed
+from slpi_ros.io.surroundings import averaging, clean, smoothed
 from slpi_ros.model.axis_model import AxisModel
 
 # Smallest numbers of samples and of reversals that allow a cross-validation.
@@ -73,6 +73,7 @@ class Part:
     others: Mapping[str, FloatArray]  # m, of the other axes from the start of the record
     digit: float  # m, resolution of the readings, 0: continuous
     surroundings: Mapping[str, FloatArray] = field(default_factory=dict)  # recorded quantities, in their units
+    averagings: Mapping[str, float] = field(default_factory=dict)  # s, of the running means of noisy quantities
     mixed: float = 0.0  # share of readings, not used, that are early, late or a mixture of two
 
 
@@ -129,6 +130,11 @@ class Evidence:
             for key in self.parts[0].surroundings
             if key in common
         }
+
+    @property
+    def averagings(self) -> Mapping[str, float]:
+        """Time constants (s) of the running means of quantities, the shortest of the records."""
+        return {key: min(part.averagings.get(key, 0.0) for part in self.parts) for key in self.surroundings}
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
@@ -228,7 +234,8 @@ def evidence_of(
             history=beginning.history,
             others=others,
             digit=digit(samples.y[samples.fitted]),
-            surroundings=_at_stamps(record, t),
+            surroundings=(beside := _at_stamps(record, t)),
+            averagings={key: averaging(record.surroundings[key]) for key in beside},
         )
         for record, (t, samples, others), beginning in zip(records, read, beginnings, strict=True)
     )

@@ -369,6 +369,10 @@ class EffectBase(Protocol):
         """Names of the recorded quantities that it follows."""
         return tuple(one.key for one in self.followed)
 
+    def averaged(self, seconds: Mapping[str, float]) -> Self:
+        """Return the effect with the time constants (s) of the means of its quantities, by name, that are taken."""
+        return self
+
     def only(self, keys: Sequence[str]) -> "Effect | None":
         """Return the effect with some of the quantities that it follows; None without any."""
         return None

@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from math import isfinite
+from math import exp, isfinite
 from typing import Any, ClassVar
 
 import numpy as np
@@ -59,7 +59,10 @@ class Quantity:
         "s", "time constant with which the stage follows, 0: at once", 0, 1e7, default=0.0,
         fit=Fit("relative", least=0.1 * SHORTEST, within_record=True, absent=True),
     )  # fmt: skip
-    # Range of the recorded values; empty: unknown.
+    averaging: float = parameter(
+        "s", "time constant of the mean of the readings that is taken in use, 0: none", 0, 1e7, default=0.0
+    )
+    # Range of the recorded values.
     lowest: float = parameter("", "lowest recorded value, in its unit", -1e30, 1e30, default=0.0)
     highest: float = parameter("", "highest recorded value, in its unit", -1e30, 1e30, default=0.0)
 
@@ -189,6 +192,12 @@ class Surroundings(EffectBase):
         """Return the effect with what is left of before its records."""
         return replace(self, initial=tuple(amplitudes.tolist()))
 
+    def averaged(self, seconds: Mapping[str, float]) -> "Surroundings":
+        """Return the effect with the time constants (s), by quantity, of the means that are taken in use."""
+        return replace(
+            self, quantities=tuple(replace(one, averaging=seconds.get(one.key, 0.0)) for one in self.quantities)
+        )
+
     @property
     def _lags(self) -> tuple[float, ...]:
         return tuple(one.time_constant for one in self.quantities if one.time_constant)
@@ -272,13 +281,16 @@ class Surroundings(EffectBase):
 
 
 class StreamingSurroundings(StreamingBase):
-    """Streaming (sample by sample) surroundings: each quantity holds its last value, at first the reference."""
+    """Streaming (sample by sample) surroundings: each quantity holds its last value, at first the reference.
+
+    Of noisy readings it is their running mean.
+    """
 
     def __init__(self, effect: Surroundings) -> None:
         self._quantities, self._origin = effect.quantities, effect.origin
         self._places = {one.key: place for place, one in enumerate(effect.quantities)}
         self._values: list[float | None] = [None] * len(effect.quantities)
-        # Input and state of each lag, by deviation from the reference.
+        # Mean and state of the lag of each quantity, by deviation from the reference.
         self._states = [(0.0, 0.0)] * len(effect.quantities)
 
     def surround(self, key: str, value: float) -> None:
@@ -325,6 +337,8 @@ class StreamingSurroundings(StreamingBase):
         states = []
         for one, value, (before, state) in zip(self._quantities, self._values, self._states, strict=True):
             moved = before if value is None else value - one.reference
+            if one.averaging:
+                moved -= exp(-dt / one.averaging) * (moved - before)
             if one.time_constant:
                 step = hold(dt, one.time_constant)
                 state = step.now * moved + step.before * before + step.kept * state

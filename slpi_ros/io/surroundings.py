@@ -1,5 +1,6 @@
 """Scalar quantities that a bag holds beside the stage: temperature, humidity, pressure, force, other stages."""
 
+import struct
 from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
@@ -8,7 +9,8 @@ import numpy as np
 from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import RecordError
 from slpi_ros.io.alignment import Signals
-from slpi_ros.io.messages import JOINT_STATE, QUANTITY_TYPES, SECOND_NS
+from slpi_ros.io.input_limits import LimitError
+from slpi_ros.io.messages import JOINT_STATE, QUANTITY_TYPES, SECOND_NS, kind_of, read_message
 from slpi_ros.io.record import Course
 
 # Topics of one stage itself: what goes with its displacement, or with the error of a model, is no cause of it.
@@ -25,6 +27,8 @@ MOST = 64
 # Readings are smoothed from this number on, and as far as their white noise exceeds this share of their range; of more
 # than `MOST_READINGS` the means of equal numbers are taken.
 FEWEST_READINGS, NOISY, MOST_READINGS = 12, 2e-3, 700
+# Time constants of running means, in intervals of the readings; largest number of readings that they are chosen by.
+AVERAGINGS, MOST_AVERAGED = np.array([1.0, 2.0, 4.0, 8.0, 16.0, 32.0]), 5000
 # What smoothing takes away is noise if its rms is at most this multiple of that.
 IS_NOISE = 1.3
 # Ratio of the median magnitude of second differences of white noise to its standard deviation.
@@ -105,6 +109,22 @@ def _overlap(one: IntArray, other: IntArray) -> bool:
     return bool(max(one.min(), other.min()) <= min(one.max(), other.max()))
 
 
+def value_of(data: bytes, msgtype: str, field: str) -> float | None:
+    """Return the value in a serialised message; None if it cannot be decoded or has no such field."""
+    try:
+        message = read_message(data, msgtype)
+    except (struct.error, UnicodeDecodeError, MemoryError, LimitError):
+        return None
+    if not kind_of(msgtype).several:
+        (values,) = message.values.values()
+        return float(values[0])
+    part, _, name = field.partition(".")
+    if part not in message.values or name not in message.names:
+        return None
+    values, place = message.values[part], message.names.index(name)
+    return float(values[place]) if place < values.size else None
+
+
 def clean(course: Course) -> Course:
     """Return a course without missing readings, at increasing times."""
     t, value = course
@@ -120,6 +140,29 @@ def smoothed(course: Course) -> Course:
     Between its readings it is linear, and beyond them as it is there.
     """
     return _smoothed(*clean(course))
+
+
+def averaging(course: Course) -> float:
+    """Return the time constant (s) of the running mean of readings that is nearest to the quantity; 0: none.
+
+    A running mean (first-order lag) takes away noise, and is late: it is compared with `smoothed`.
+    """
+    t, value = clean(course)
+    t, value = t[:MOST_AVERAGED], value[:MOST_AVERAGED]
+    if t.size < FEWEST_READINGS:
+        return 0.0
+    true = np.interp(t, *_smoothed(t, value))
+    best, least = 0.0, float(np.mean((value - true) ** 2))
+    if not least > 0.0:
+        return 0.0
+    for tau in (float(np.median(np.diff(t))) * AVERAGINGS).tolist():
+        kept, mean, error = np.exp(-np.diff(t, prepend=t[0]) / tau).tolist(), float(true[0]), 0.0
+        for share, reading, wanted in zip(kept, value.tolist(), true.tolist(), strict=True):
+            mean = reading + share * (mean - reading)
+            error += (mean - wanted) ** 2
+        if error / t.size < least:
+            best, least = tau, error / t.size
+    return best
 
 
 def _smoothed(t: FloatArray, value: FloatArray) -> Course:

@@ -275,6 +275,10 @@ class Surroundings(EffectBase):
         """Describe for each quantity what one unit does, and the time constant."""
         return "; ".join(map(_described, self.quantities))
 
+    def laws(self) -> Mapping[str, Any]:
+        """Return nothing: it does nothing at the reference values, and others are undone beforehand."""
+        return {}
+
     def streaming(self) -> "StreamingSurroundings":
         """Return the streaming effect, at first at the reference values."""
         return StreamingSurroundings(self)

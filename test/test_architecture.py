@@ -199,6 +199,9 @@ NAMED_ELSEWHERE = {
     "identification/record_quality.py": ({"creep", "delay", "lag"}, "what a drive lacks, in words"),
     "diagnosis/tracking.py": ({"delay"}, "a part of a tracking error"),
     "reports/verification.py": ({"delay"}, "the same, in words"),
+    "nodes/compensator.py": ({"surroundings"}, "the same"),
+    "nodes/compensator_parameters.py": ({"surroundings"}, "the same"),
+    "nodes/identify.py": ({"surroundings"}, "the parameter, which names topics"),
 }
 
 

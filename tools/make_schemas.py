@@ -3,7 +3,7 @@
 import json
 import textwrap
 from collections.abc import Mapping
-from dataclasses import fields, is_dataclass
+from dataclasses import MISSING, fields, is_dataclass
 from math import isfinite
 from pathlib import Path
 from typing import get_args, get_origin
@@ -15,6 +15,8 @@ SCHEMAS = Path(__file__).resolve().parents[1] / "msg_schemas"
 # A unit without a name stands as it is.
 UNITS = {"s": "Seconds", "V": "Volts", "m": "Metres", "Hz": "Hertz", "rad": "Radians"}
 WIDTH = 120
+# Characters of the name of a topic or field.
+LONGEST_NAME = 255
 
 
 def model_schema(schema):
@@ -35,6 +37,11 @@ def model_schema(schema):
 def diagnosis_schema(schema):
     """Return the schema of diagnoses with all effects."""
     schema["$defs"]["effect"]["enum"] = list(EFFECTS)
+    alternatives = schema["properties"]["axes"]["additionalProperties"]["properties"]["effects"]["items"]
+    alternatives["properties"]["alternatives"]["items"] = {
+        "type": "string",
+        "pattern": f"^({'|'.join(EFFECTS)})( .+)?$",
+    }
     return schema
 
 
@@ -42,16 +49,22 @@ def _fields(kind):
     """Return the schema of the parameters of an effect, or of an element of a list of dataclasses."""
     types = {item.name: item.type for item in fields(kind)}
     facts = facts_of(kind)
+    texts = {item.name: item for item in fields(kind) if "text" in item.metadata}
+    required = [name for name, item in texts.items() if item.default is MISSING]
+    named = {
+        name: {"type": "string", "maxLength": LONGEST_NAME, "description": _sentence(item.metadata["text"])}
+        for name, item in texts.items()
+    }
     return {
-        "required": [name for name, each in facts.items() if each.required],
+        "required": [*required, *(name for name, each in facts.items() if each.required)],
         "additionalProperties": False,
-        "properties": {name: _field(each, types[name]) for name, each in facts.items()},
+        "properties": named | {name: _field(each, types[name]) for name, each in facts.items()},
     }
 
 
 def _field(facts, kind):
     unit = f" {UNITS.get(facts.unit, facts.unit)}." if facts.unit else ""
-    about = {"description": f"{facts.meaning[0].upper()}{facts.meaning[1:]}{'; null: none' * facts.none}.{unit}"}
+    about = {"description": _sentence(f"{facts.meaning}{'; null: none' * facts.none}") + unit}
     few, most = facts.count
     holds = get_origin(kind)
     if holds is tuple:
@@ -62,6 +75,10 @@ def _field(facts, kind):
         names = {"propertyNames": {"maxLength": 100}, "additionalProperties": _number(facts)}
         return {"type": "object", "minProperties": few, "maxProperties": most, **names} | about
     return _number(facts) | about
+
+
+def _sentence(text):
+    return f"{text[0].upper()}{text[1:]}."
 
 
 def _number(facts):

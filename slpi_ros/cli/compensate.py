@@ -16,7 +16,9 @@ def _add_options(command: ArgumentParser) -> None:
     from slpi_ros.model.axis_model import START_MEMORIES
 
     command.add_argument("model", metavar="MODEL.json", help="model of the stage")
-    command.add_argument("table", metavar="DESIRED.csv", help="columns time_s, <axis>_m")
+    command.add_argument(
+        "table", metavar="DESIRED.csv", help="columns time_s, <axis>_m, and <topic> of quantities that it follows"
+    )
     common.add_output(command, "VOLTAGE.csv", "columns time_s, <axis>_V")
     command.add_argument("--voltage-min", metavar="V", type=float, default=-math.inf, help="default: identified range")
     command.add_argument("--voltage-max", metavar="V", type=float, default=math.inf, help="default: identified range")
@@ -35,7 +37,7 @@ def _run(options: Namespace) -> Result:
     import numpy as np
 
     from slpi_ros.io.outputs import allow_table
-    from slpi_ros.io.tables import read_table, table_header, write_table
+    from slpi_ros.io.tables import read_table_with, table_header, write_table
     from slpi_ros.model.coverage import path_beyond
     from slpi_ros.model.document import load_model
     from slpi_ros.model.limits import MAX_DT, Limits
@@ -44,15 +46,16 @@ def _run(options: Namespace) -> Result:
 
     common.require_another_file(options.output, options.model, options.table)
     model = load_model(options.model)
-    t, desired = read_table(options.table, "m")
+    t, desired, surroundings = read_table_with(options.table, "m", model.quantities)
     check_time(t)
     known = common.model_columns(desired, model, options.table)
     options.remarks += allow_table(options.output, table_header(known, "V"), overwrite=options.overwrite)
     if options.slew_limit < 0.0 or math.isnan(options.slew_limit):
         raise UsageError(f"--slew-limit {options.slew_limit:g}: give a positive number of V/s, or 0 for no limit")
+    options.remarks += common.left_out(model, surroundings)
     limits = Limits(options.voltage_min, options.voltage_max, options.slew_limit or math.inf)
     try:
-        answers = model.command(t, known, limits, options.start_memory)
+        answers = model.command(t, known, limits, options.start_memory, surroundings)
     except SlpiError as error:
         raise type(error)(f"{options.table}, {error}") from None
     for axis, (_, held) in answers.items():

@@ -17,6 +17,9 @@ def _add_options(command: ArgumentParser) -> None:
     common.add_output(command, "DIR", "folder of diagnosis.json, extended_model.json and report.html")
     common.add_topics(command)
     common.add_axes(command, help="default: every axis that bag and model share")
+    common.add_with(
+        command, "every temperature, humidity, pressure, force, number and other stage of the bag, each by itself"
+    )
     common.add_span(command)
     common.add_sensor(command)
 

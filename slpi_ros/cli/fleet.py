@@ -29,6 +29,7 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument("--no-diagnose", action="store_true", help="no search for causes of errors; default: search")
     command.add_argument("--watch", action="store_true", help="go on with bags that are completed later; default: end")
     common.add_topic(command)
+    common.add_with(command, "none; for a diagnosis every one that the bags hold")
 
 
 def _run(options: Namespace) -> Result:
@@ -52,6 +53,7 @@ def _run(options: Namespace) -> Result:
         diagnose=not options.no_diagnose,
         watch=options.watch,
         topic=options.topic,
+        surroundings=options.quantities,
     )
     text = "\n".join(lines)
     return Result(text.splitlines(), text, "slpi refit MODEL.json BAG... of a stage that has changed", passed=usable)

@@ -21,6 +21,7 @@ def _add_options(command: ArgumentParser) -> None:
     )
     common.add_topics(command)
     common.add_axes(command, help="default: every axis of the bag")
+    common.add_with(command, "none")
     common.add_span(command)
     common.add_sensor(command, "0")
     command.add_argument(
@@ -65,6 +66,7 @@ def _run(options: Namespace) -> Result:
     if options.uncertainty:
         lines += [f"axis {axis}: {one.line()}" for axis, one in done.uncertainty().items()]
     limits = model_limits(model)
+    options.remarks += [f"{one}; `slpi diagnose` looks for other causes" for one in done.unmoved]
     warned = [line for one in found for line in finding_lines(one, all_levels=False)]
     told = [line for one in found for line in finding_lines(one)]
     if limits:

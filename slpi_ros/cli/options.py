@@ -3,7 +3,7 @@
 import math
 import os
 from argparse import Action, ArgumentError, ArgumentParser, ArgumentTypeError, Namespace
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -138,13 +138,27 @@ def add_topics(command: ArgumentParser) -> None:
     )
 
 
+def add_with(command: ArgumentParser, default: str) -> None:
+    """Add ``--with``."""
+    command.add_argument(
+        "--with", dest="quantities", metavar="TOPIC[:FIELD]", nargs="+", action=_UniqueNames,
+        help=f"recorded quantities that the stage may follow, such as a temperature or load; default: {default}",
+    )  # fmt: skip
+
+
+def left_out(model: "StageModel", surroundings: "Mapping[str, FloatArray]") -> list[str]:
+    """Return a remark on the quantities that a model follows and a table lacks."""
+    missing = [key for key in model.quantities if key not in surroundings]
+    return [f"no column {', '.join(missing)}: taken as its reference value"] if missing else []
+
+
 def source_of(options: Namespace) -> "Source":
     """Return bags, topics, axes and part of the records that the options select."""
     topic = _topics_of(options) if "voltage_topic" in options else options.topic
     from slpi_ros.workflows.records import Source
 
     start, stop = getattr(options, "start", None), getattr(options, "stop", None)
-    return Source(options.bags, topic, options.axis, start, stop)
+    return Source(options.bags, topic, options.axis, start, stop, surroundings=getattr(options, "quantities", None))
 
 
 def _topics_of(options: Namespace) -> "str | SeparateTopics":
@@ -190,6 +204,8 @@ def same_record(options: Namespace) -> list[str]:
             words.append(f"--{name.replace('_', '-')}={value}")
     if getattr(options, "voltage_measured", False):
         words.append("--voltage-measured")
+    if getattr(options, "quantities", None):
+        words += ["--with", *options.quantities]
     if options.axis:
         words += ["--axis", *options.axis]
     return words

@@ -19,6 +19,7 @@ def _add_options(command: ArgumentParser) -> None:
     common.add_output(command, "MODEL.json", "may be the input model file")
     common.add_topic(command)
     common.add_axes(command, help="default: every axis that bag and model share")
+    common.add_with(command, "those that the model follows")
     common.add_span(command)
     common.add_sensor(command)
     command.add_argument(

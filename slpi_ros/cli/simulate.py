@@ -8,21 +8,26 @@ from slpi_ros.cli.command import Command, Result, command_line
 
 def _add_options(command: ArgumentParser) -> None:
     command.add_argument("model", metavar="MODEL.json", help="model of the stage")
-    command.add_argument("table", metavar="VOLTAGE.csv", help="columns time_s, <axis>_V")
+    command.add_argument(
+        "table",
+        metavar="VOLTAGE.csv",
+        help="columns time_s, <axis>_V, and <topic> of quantities that the stage follows",
+    )
     common.add_output(command, "DISPLACEMENT.csv", "columns time_s, <axis>_m")
 
 
 def _run(options: Namespace) -> Result:
     from slpi_ros.io.outputs import allow_table
-    from slpi_ros.io.tables import read_table, table_header, write_table
+    from slpi_ros.io.tables import read_table_with, table_header, write_table
     from slpi_ros.model.document import load_model
 
     common.require_another_file(options.output, options.model, options.table)
     model = load_model(options.model)
-    t, voltage = read_table(options.table, "V")
+    t, voltage, surroundings = read_table_with(options.table, "V", model.quantities)
     known = common.model_columns(voltage, model, options.table)
     options.remarks += allow_table(options.output, table_header(known, "m"), overwrite=options.overwrite)
-    reached = model.simulate(t, known)
+    options.remarks += common.left_out(model, surroundings)
+    reached = model.simulate(t, known, surroundings)
     write_table(options.output, t, reached, "m")
     for axis, v in known.items():
         low, high = model.axes[axis].voltage_range

@@ -37,6 +37,7 @@ def _add_options(command: ArgumentParser) -> None:
         help="initial state of the stage: as at the end of the identified record, as at its start, or after a reset; "
         "default: found from the record",
     )  # fmt: skip
+    common.add_with(command, "those that the model follows")
     common.add_span(command, "what is judged")
     common.add_topics(command)
     common.add_axes(command, help="default: every axis that bags and model share")

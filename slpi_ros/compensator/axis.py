@@ -83,6 +83,7 @@ class Axis:
         # Setpoint and displacement of the model as a sensor with delay or lag tells them; None without these.
         self._setpoint: Sensed | None = None
         self._expected: Sensed | None = None
+        self.surroundings: dict[str, float] = {}  # values of quantities in use
 
     # State
 
@@ -172,6 +173,18 @@ class Axis:
             self._forget_residuals()
         elif self._loop_settings.enabled:
             self._close_loop()
+        for one in self._streams:
+            one.surround(self.surroundings)
+
+    def surround(self, key: str, value: float) -> None:
+        """Take a value of a quantity that the stage follows; it counts from the next sample on."""
+        self.surroundings[key] = value
+        for stream in self._streams:
+            stream.surround({key: value})
+
+    @property
+    def _streams(self) -> tuple[StreamingInverse, ...]:
+        return (self.stream, self._applied) if self._feedback else (self.stream,)
 
     def locate(self, voltage: float) -> None:
         """Continue from a voltage (V) at which the amplifier was found; a move to it that is no noise is remembered."""
@@ -439,6 +452,7 @@ class Axis:
         for name in START_MEMORIES:
             streams[name] = stream = take_over(self.model, self.limits, (), name)
             stream.coupled = self.stream.coupled
+            stream.surround(self.surroundings)
             errors[name] = abs(measured - stream.drive(present))
         best = min(START_MEMORIES, key=lambda name: errors[name])
         self.start_memory = None

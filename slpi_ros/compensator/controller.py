@@ -26,6 +26,7 @@ from slpi_ros.compensator.persistence import (
 from slpi_ros.compensator.ramps import Ramp, Safety
 from slpi_ros.compensator.sensor_watch import Fault
 from slpi_ros.compensator.statistics import Counts
+from slpi_ros.compensator.surroundings import Surrounding
 from slpi_ros.compensator.trajectory import CHECKED_FIRST, CHECKED_LATER, PaceCheck, Trajectory, TrajectoryExecutor
 from slpi_ros.compensator.validation import RejectedError, TimestampRules, require_names
 from slpi_ros.compensator.watchdog import CommandWatchdog
@@ -81,6 +82,8 @@ class Controller:
         self.ownership = Ownership(self.axes, starts)  # whether voltages may be output
         self._checks: list[PaceCheck] = []
         self.too_fast = ""  # the first point of the trajectory that will be late; "" if none is known
+        # Quantities that the model in use follows, by name.
+        self.surroundings: dict[str, Surrounding] = {}
         self.voltages = array("d", [0.0] * len(self.axes))  # V, updated in place
         self.mode = OperatingMode.UNCONFIGURED
         self.counts = Counts()
@@ -174,6 +177,21 @@ class Controller:
                 axis.locate(last_voltages[axis.name])
         self.model, self.identified = model, identified
         self._couple()
+        known = self.surroundings
+        self.surroundings = {}
+        for followed in (one for axis in model.axes.values() for one in axis.followed):
+            before = known.get(followed.key)
+            same = before is not None and before.followed == followed
+            self.surroundings[followed.key] = before if before and same else Surrounding(followed)
+
+    def surround(self, key: str, value: float, now_ns: int) -> bool:
+        """Take a value of a quantity that came at `now_ns` (ns); return whether it is used."""
+        known = self.surroundings.get(key)
+        if known is None or not known.note(value, now_ns):
+            return False
+        for axis in self.axes:
+            axis.surround(key, value)
+        return True
 
     def set_zero(self, now_ns: int) -> dict[str, float | None]:
         """Let the models agree with the sensors now; return by how much (m) each zero moves, None: not measured."""

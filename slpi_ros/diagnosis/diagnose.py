@@ -14,7 +14,7 @@ from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
-from slpi_ros.diagnosis.selection import BIAS, Selection, is_own, seen, select
+from slpi_ros.diagnosis.selection import BIAS, CONVERGED, Selection, contenders, is_own, seen, select
 from slpi_ros.diagnosis.significance import NO_WORSE, counts
 from slpi_ros.effects.registry import EFFECTS, in_order
 from slpi_ros.errors import SlpiError, UsageError
@@ -102,6 +102,42 @@ def diagnose(
     return Diagnosis(found, replace(model, axes=extended, created=created), source)
 
 
+def following(
+    records: Sequence[Record], model: StageModel, *, start: float | None = None, stop: float | None = None
+) -> tuple[StageModel, tuple[str, ...]]:
+    """Return a model that follows the quantities of its records, and sentences on those that its axes do not follow.
+
+    Hysteresis and effect are fitted jointly; a quantity counts as in a diagnosis, but no other cause is looked for.
+    UsageError if the kind of the model is not fitted together with effects.
+    """
+    axes, told = dict(model.axes), []
+    source = ", ".join(each.source for each in records)
+    for axis, known in model.axes.items():
+        if known.kind not in REFITTED:
+            raise UsageError(
+                f"kind '{known.kind}' is not fitted with recorded quantities; choose one of {', '.join(REFITTED)}"
+            )
+        undone = [corrected(each, {axis: known.sensor.undo}) if known.sensor else each for each in records]
+        with threadpool_limits(1):
+            evidence = evidence_of(undone, axis, replace(known, sensor=IDEAL), start, stop)
+            now = Explanation(evidence, ())
+            for _ in evidence.surroundings:
+                report_progress(f"axis {axis}: {len(now.effects)} effects, trying recorded quantities")
+                found = contenders(now, [name for name, effect in EFFECTS.items() if effect.follows_quantities])
+                if not found or not found[0].counts_beside(now):
+                    break
+                now = found[0].explanation
+            now = now.refined(CONVERGED)
+            follows = [key for effect in now.effects for key in effect.keys]
+            if follows:
+                axes[axis] = replace(_extended(known, now, source), sensor=known.sensor)
+        left = [
+            key for key in dict.fromkeys(key for each in records for key in each.surroundings) if key not in follows
+        ]
+        told += [f"axis '{axis}' does not follow {key}, as far as the records tell" for key in left]
+    return replace(model, axes=axes), tuple(told)
+
+
 def _require_different(records: Sequence[Record]) -> None:
     """Raise UsageError if a record is given twice: held out, it would be predicted from its copy."""
     for number, record in enumerate(records):
@@ -120,7 +156,7 @@ def _diagnose_axis(
     evidence = evidence_of(records, axis, model, start, stop)
     same = len(records) == 1 and model.quality.source == records[0].source
     # Effects that belong to one record (drift, lines, the knots of a gain drift) do not apply to another.
-    shared = [effect for effect in model.effects if same or not is_own(effect)]
+    shared = [effect.anew for effect in model.effects if same or not is_own(effect)]
     base = Explanation(evidence, shared)
     known = [effect for effect in shared if effect.in_phase(seen(base))]
     if len(known) < len(shared):
@@ -258,6 +294,7 @@ def _repeatability(now: Explanation) -> Repeatability:
 
 
 def _run(model: AxisModel, part: Part, *, of_record: bool) -> FreeRun:
+    model = model.surrounded({key: (part.t, value) for key, value in part.surroundings.items()})
     known, starts = _known(part), _starts(model, part)
     return free_run(model, part.t, part.v, part.y, part.used, known, starts, others=part.others, of_record=of_record)
 
@@ -398,7 +435,7 @@ def _extended(model: AxisModel, now: Explanation, source: str) -> AxisModel:
         voltage_range=(float(voltage.min()), float(voltage.max())),
         displacement_range=(float(y.min()), float(y.max())),
         effects=tuple(
-            effect.started(now.began[effect.name], len(evidence.parts))
+            effect.started(now.began[effect.name], len(evidence.parts)).averaged(evidence.averagings)
             for effect in now.with_uncertainty()
             if not isinstance(effect, EachRecord)
         ),

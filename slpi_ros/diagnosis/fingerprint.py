@@ -24,6 +24,8 @@ from slpi_ros.identification.signal_statistics import noise
 BLOCKS, FOLDS = 40, 5
 # Number of knots of the function of a variable; for time one for each two blocks, so that it spans a held-out block.
 KNOTS, KNOTS_OF_TIME = 12, 20
+# The same for a recorded quantity: few, as it may drift, and with many any function of time would be one of it.
+KNOTS_OF_QUANTITY = 4
 # Weight of the roughness of a function, relative to the largest eigenvalue of its equations.
 ROUGHNESS = 1e-5
 # Smallest share of the mean square that is told.
@@ -53,13 +55,22 @@ HINTS: Mapping[str, str] = {
 }
 
 
+def hint(variable: str) -> str:
+    """Return what a variable suggests to look at; one that is not in `HINTS` is a recorded quantity."""
+    return HINTS.get(variable, "change that alone, on purpose, up and down, and record it")
+
+
 class Signals(NamedTuple):
-    """Used samples of one record, shape (N,) each: time (s), voltage (V), displacement and residual of a model (m)."""
+    """Used samples of one record, shape (N,) each: time (s), voltage (V), displacement and residual of a model (m).
+
+    `surroundings` are recorded quantities by name, in their units.
+    """
 
     t: FloatArray
     v: FloatArray
     y: FloatArray
     residual: FloatArray
+    surroundings: Mapping[str, FloatArray] = {}
 
 
 @dataclass(frozen=True)
@@ -83,7 +94,7 @@ class Left:
 def fingerprint(records: Sequence[Signals]) -> tuple[Left, ...]:
     """Return the measured variables that predict the residuals of records of one axis, the largest share first."""
     centred, thin = [_centred(record) for record in records], [_centred(_thinned(record)) for record in records]
-    found = [*_of_variables(thin), *_of_lines(centred), *_of_jumps(centred)]
+    found = [*_of_variables(thin), *_of_surroundings(thin), *_of_lines(centred), *_of_jumps(centred)]
     return tuple(sorted((one for one in found if one.share >= LEAST_SHARE), key=lambda one: -one.share))
 
 
@@ -111,7 +122,9 @@ def half_power(records: Sequence[Signals]) -> float:
 
 def _thinned(record: Signals) -> Signals:
     every = -(-record.t.size // ENOUGH)
-    return Signals(*(x[::every] for x in record))
+    beside = {key: value[::every] for key, value in record.surroundings.items()}
+    t, v, y, residual, _ = record
+    return Signals(t[::every], v[::every], y[::every], residual[::every], beside)
 
 
 def _centred(record: Signals) -> Signals:
@@ -140,12 +153,22 @@ def _of_variables(records: Sequence[Signals]) -> Iterator[Left]:
             columns = columns[:, :KNOTS] - columns[:, KNOTS:]
         share, fitted = _share(columns, records)
         if share >= LEAST_SHARE:
-            hint = HINTS[name]
-            turns = min(_turns(record).size for record in records)
+            advice, turns = HINTS[name], min(_turns(record).size for record in records)
             if name == "time" and turns < FEWEST_TURNS:
-                hint = f"a record with {turns} turns cannot tell time from its drive: record more cycles, or {hint}"
+                advice = f"a record with {turns} turns cannot tell time from its drive: record more cycles, or {advice}"
             evidence = _evidence(name, unit, share, x, fitted, up if branches else None)
-            yield Left(name, share, f"{evidence}; {hint}", _curve(x, fitted), unit)
+            yield Left(name, share, f"{evidence}; {advice}", _curve(x, fitted), unit)
+
+
+def _of_surroundings(records: Sequence[Signals]) -> Iterator[Left]:
+    for key in records[0].surroundings if records else ():
+        if all(key in record.surroundings for record in records):
+            x = np.concatenate([record.surroundings[key] for record in records])
+            if np.ptp(x) > 0.0:
+                share, fitted = _share(_hats(x, KNOTS_OF_QUANTITY, even=False), records)
+                if share >= LEAST_SHARE:
+                    evidence = _evidence(key, "", share, x, fitted, None)
+                    yield Left(key, share, f"{evidence}; {hint(key)}", _curve(x, fitted))
 
 
 def _variables(record: Signals) -> dict[str, FloatArray]:

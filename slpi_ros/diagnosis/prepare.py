@@ -23,6 +23,7 @@ from slpi_ros.identification.refit import basis_of
 from slpi_ros.identification.samples import Samples, select_samples
 from slpi_ros.identification.signal_statistics import digit
 from slpi_ros.io.record import Record
+from slpi_ros.io.surroundings import averaging, clean, smoothed
 from slpi_ros.model.axis_model import AxisModel
 
 # Smallest numbers of samples and of reversals that allow a cross-validation.
@@ -31,6 +32,8 @@ FEWEST_SAMPLES, FEWEST_TURNS = 1000, 4
 VERTICES = 41
 # Largest number of vertices of a loop family while effects are selected.
 COARSE = 31
+# A quantity is looked at if it has this many readings, and they span this share of the time.
+FEWEST_READINGS, ENOUGH_TIME = 8, 0.7
 # Samples before the reset of the hysteresis state may be excluded if at least this share of the samples remains.
 ENOUGH_WIPED = 0.5
 # They are excluded if their error exceeds that of the others by this factor, because the motion before the record is
@@ -69,6 +72,8 @@ class Part:
     history: tuple[float, ...]  # V, as in `slpi_ros.model.axis_model.Start`
     others: Mapping[str, FloatArray]  # m, of the other axes from the start of the record
     digit: float  # m, resolution of the readings, 0: continuous
+    surroundings: Mapping[str, FloatArray] = field(default_factory=dict)  # recorded quantities, in their units
+    averagings: Mapping[str, float] = field(default_factory=dict)  # s, of the running means of noisy quantities
     mixed: float = 0.0  # share of readings, not used, that are early, late or a mixture of two
 
 
@@ -117,6 +122,21 @@ class Evidence:
         }
 
     @cached_property
+    def surroundings(self) -> Mapping[str, FloatArray]:
+        """Quantities that all records contain, shape (N,), in their units."""
+        common = set.intersection(*(set(part.surroundings) for part in self.parts))
+        return {
+            key: np.concatenate([part.surroundings[key] for part in self.parts])
+            for key in self.parts[0].surroundings
+            if key in common
+        }
+
+    @property
+    def averagings(self) -> Mapping[str, float]:
+        """Time constants (s) of the running means of quantities, the shortest of the records."""
+        return {key: min(part.averagings.get(key, 0.0) for part in self.parts) for key in self.surroundings}
+
+    @cached_property
     def slices(self) -> tuple[slice, ...]:
         """Slice of the samples of each record."""
         ends = np.cumsum([0, *(part.t.size for part in self.parts)]).tolist()
@@ -135,7 +155,11 @@ class Evidence:
         return EffectContext(
             self.t,
             others=self.others,
-            records=tuple(EffectContext(part.t, others=part.others, grid=Uniform.over(part.t)) for part in self.parts),
+            records=tuple(
+                EffectContext(part.t, others=part.others, grid=Uniform.over(part.t), surroundings=part.surroundings)
+                for part in self.parts
+            ),
+            surroundings=self.surroundings,
         )
 
     @cached_property
@@ -210,6 +234,8 @@ def evidence_of(
             history=beginning.history,
             others=others,
             digit=digit(samples.y[samples.fitted]),
+            surroundings=(beside := _at_stamps(record, t)),
+            averagings={key: averaging(record.surroundings[key]) for key in beside},
         )
         for record, (t, samples, others), beginning in zip(records, read, beginnings, strict=True)
     )
@@ -239,6 +265,16 @@ def _readings(
     v, y, fitted, mixed = samples.v[chosen], samples.y[chosen], samples.fitted[chosen], samples.mixed * chosen.size
     samples = replace(samples, v=v, y=y, fitted=fitted, mixed=mixed // samples.v.size)
     return t[chosen], samples, {name: y[chosen] for name, y in others.items()}
+
+
+def _at_stamps(record: Record, t: FloatArray) -> dict[str, FloatArray]:
+    """Return the quantities of a record at times `t`, shape (N,), s, that were recorded over most of that."""
+    found = {}
+    for key, course in record.surroundings.items():
+        at, _ = clean(course)
+        if at.size >= FEWEST_READINGS and min(at[-1], t[-1]) - max(at[0], t[0]) >= ENOUGH_TIME * (t[-1] - t[0]):
+            found[key] = np.interp(t, *smoothed(course))
+    return found
 
 
 def _trusted(part: Part, residual: FloatArray, samples: Samples, *, only_after_reset: bool) -> Part:

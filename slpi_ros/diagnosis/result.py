@@ -8,7 +8,7 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.diagnosis.effect_parameters import EachRecord
-from slpi_ros.diagnosis.fingerprint import HINTS, Left, Signals, fingerprint, half_power
+from slpi_ros.diagnosis.fingerprint import Left, Signals, fingerprint, half_power, hint
 from slpi_ros.diagnosis.joint_fit import Explanation, Score
 from slpi_ros.diagnosis.prepare import MOST_SAMPLES, Evidence, one_speed
 from slpi_ros.diagnosis.selection import BIAS, LEVEL, NOT_CLOSING, Named, Selection, held_out_error
@@ -125,6 +125,7 @@ class AxisDiagnosis:
     traces: Traces  # of the first record
     left: tuple[Left, ...] = ()  # variables that go with what is left, the largest share first
     records: tuple[RecordOutcome, ...] = ()
+    surroundings: tuple[str, ...] = ()  # recorded quantities that were looked at
     dropped: tuple[str, ...] = ()  # found on some records, but do not carry over to others
     given: "Given | None" = None
 
@@ -154,6 +155,7 @@ class AxisDiagnosis:
             "next_experiment": self.next_experiment,
             "records": [record.to_document() for record in self.records],
             "dropped": list(self.dropped),
+            "looked_at": list(self.surroundings),
         }
 
 
@@ -223,7 +225,8 @@ def judged(
         + _goes_with(left, verdict, signals)
         + _in_model(now, effects, selection.dropped)
         + _mixed(now.evidence)
-        + _cannot_tell(driven_alike),
+        + _cannot_tell(driven_alike)
+        + _looked_at(now.evidence, effects),
         noise_rms=noise_rms,
         repeatability_rms=repeatability.rms,
         repeatability_source=repeatability.source,
@@ -235,6 +238,7 @@ def judged(
         traces=_traces(base, now),
         left=left,
         records=records,
+        surroundings=tuple(now.evidence.surroundings),
         dropped=selection.dropped,
         given=given,
     )
@@ -290,7 +294,8 @@ def _signals(now: Explanation) -> list[Signals]:
     records = []
     for part, rows in zip(evidence.parts, evidence.slices, strict=True):
         used = part.used
-        records.append(Signals(part.t[used], part.v[used], part.y[used], now.residual[rows][used]))
+        beside = {key: value[used] for key, value in part.surroundings.items()}
+        records.append(Signals(part.t[used], part.v[used], part.y[used], now.residual[rows][used], beside))
     return [record for record in records if record.t.size]
 
 
@@ -372,6 +377,13 @@ def _cannot_tell(driven_alike: Sequence[str]) -> str:
     return f" Axis {', '.join(driven_alike)} has the same drive: whether it couples into this one cannot be told."
 
 
+def _looked_at(evidence: Evidence, effects: Sequence[NamedEffect]) -> str:
+    """Return which recorded quantities were looked at and are not among the causes."""
+    followed = {key for named in effects for key in named.effect.keys}
+    others = [key for key in evidence.surroundings if key not in followed]
+    return f" Looked at, and no cause by what this tells: {', '.join(others)}." if others else ""
+
+
 def _next(
     verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], left: Sequence[Left], *, stale: bool
 ) -> str | None:
@@ -381,7 +393,7 @@ def _next(
         first = next((named for named in effects if named.alternatives), effects[0])
         steps.append(_separating((first.name, *first.alternatives), selection.now.evidence))
     if verdict == PARTLY_NAMED and left:
-        steps.append(f"For what is left, {HINTS[left[0].variable]}.")
+        steps.append(f"For what is left, {hint(left[0].variable)}.")
     elif verdict in (UNEXPLAINED, PARTLY_NAMED) and not steps:
         steps.append(_more_loops(selection.now.evidence))
     return " ".join(steps) or None

@@ -106,7 +106,13 @@ class Contender:
     def counts_beside(self, now: Explanation) -> bool:
         """Return whether the candidate significantly improves the joint fit `now`, which does not include it."""
         least = LEAST_GAIN_IN_COMPANY if EFFECTS[self.name].companion() else least_gain(self.name, now)
-        return counts(now.held_out, self.score, own=is_own(self.effect), least=least, trials=self.trials)
+        helps = partial(counts, own=is_own(self.effect), least=least, trials=self.trials)
+        if not helps(now.held_out, self.score):
+            return False
+        beside = self.effect.confounders(self.explanation)
+        if not beside.shape[1]:
+            return True
+        return helps(now.beside(beside).held_out, self.explanation.beside(beside).held_out)
 
 
 def seen(now: Explanation) -> FitContext:
@@ -356,6 +362,8 @@ def _grown(base: Explanation, family: Explanation | None, beginnings: tuple[Effe
         if EFFECTS[best.name].companion():
             best = best.refined(CONVERGED)
         beside = [one.effect for one in found if one.name != best.name] if begun else list(beginnings[1:])
+        # It has proved itself beside these.
+        beside = [effect for effect in beside if effect.name not in best.effect.proved_beside]
         if not beginnings:
             significant = (one.effect for one in found if one.name != best.name and one.counts_beside(now))
             beginnings = (best.effect, *significant)
@@ -428,12 +436,31 @@ def _without(name: str, now: Explanation, rivals: dict[str, list[Effect]], refus
 def _simplest(found: Sequence[Contender], now: Explanation) -> Contender:
     """Return the candidate with the fewest parameters among those that the records do not distinguish from the best."""
     alone = one_speed(now.evidence)
+    if proved := _proved(found, now):
+        return proved
     equal = [
         other
         for other in found
         if other is found[0] or (other.counts_beside(now) and alike(found[0], other, now.held_out, one_speed=alone))
     ]
     return min(equal, key=lambda one: (one.parameters, one.score.rms))
+
+
+def _proved(found: Sequence[Contender], now: Explanation) -> Contender | None:
+    """Return the candidate that proves itself beside what follows time alone, if that is the best and it does as well.
+
+    As well: it explains most of what the best one explains beside the same signals.
+    """
+    best = found[0]
+    for one in found[1:]:
+        if best.name in one.effect.proved_beside and one.counts_beside(now):
+            beside = one.effect.confounders(one.explanation)
+            rest, by_best, by_one = (
+                each.beside(beside).held_out.rms ** 2 for each in (now, best.explanation, one.explanation)
+            )
+            if rest - by_one >= ALTERNATIVE * (rest - by_best):
+                return one
+    return None
 
 
 def _without_needless(now: Explanation, names: Collection[str], *, restart: bool = True) -> Explanation:
@@ -524,11 +551,27 @@ def _in_its_place(
     tried = _tried(name, now, rest, rivals)
     alone = one_speed(now.evidence)
     alternatives = [other.name for other in tried if alike(best, other, rest.held_out, one_speed=alone)]
+    alternatives += _other_quantities(best, one_speed=alone)
     if alone and EFFECTS[name].dynamic and not alternatives:
         # At a single frequency a better fit only means a more suitable loop shape.
         others = [*(other.name for other in tried), *(key for key in EFFECTS if EFFECTS[key].time_shift != "only")]
         alternatives = [other for other in others if other != name and EFFECTS[other].dynamic][:1]
     return tuple(alternatives), (tried[0].name, tried[0].score.rms) if tried else None
+
+
+def _other_quantities(best: Contender, *, one_speed: bool) -> list[str]:
+    """Return the recorded quantities, as labels, that do as well as one of those that an effect follows."""
+    name, now, keys = best.name, best.explanation, best.effect.keys
+    found = []
+    for key in keys:
+        kept = best.effect.only([other for other in keys if other != key])
+        rest = now.replacing(name, kept).refined(2) if kept else now.without(name)
+        for _, effect in _screened(name, rest, []):
+            if keys_of_new := [other for other in effect.keys if other not in keys]:
+                other = Contender(name, rest.adding(effect)).refined()
+                if alike(best, other, rest.held_out, one_speed=one_speed):
+                    found += [f"{name} {new}" for new in keys_of_new]
+    return list(dict.fromkeys(found))
 
 
 def _do_not_close(now: Explanation) -> FloatArray:

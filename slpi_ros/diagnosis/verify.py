@@ -25,7 +25,7 @@ from slpi_ros.identification.repeatability import repeatability_of
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import RESOLUTION, START_MEMORIES, AxisModel, StartMemory
-from slpi_ros.model.coverage import record_beyond
+from slpi_ros.model.coverage import record_beyond, surroundings_beyond
 from slpi_ros.model.stage_model import StageModel
 
 SCHEMA = "slpi_ros/verification/2"
@@ -293,9 +293,9 @@ def verify(
     found: dict[str, list[RecordVerification]] = {name: [] for name in names}
     for record, path in zip(records, paths, strict=True):
         # Errors are those of the stage, not those of its sensor.
-        runs = _free_run(model.correct(record), model.stage_only, names, (start, stop), start_memory)
+        runs = _free_run(model.correct(record), model.stage_only.surrounded(record), names, (start, stop), start_memory)
         for name in names:
-            axis, run = model.axis(name), runs[name]
+            axis, run = model.surrounded(record).axis(name), runs[name]
             one = _judge(run, axis, record.source, tolerance, without_offset=without_offset)
             if path is not None and name in path:
                 followed = path[name][np.isfinite(record.voltage[name])][: run.t.size]
@@ -483,7 +483,7 @@ def _judge(
         width=found.width_change,
         match=found,
         outside=int(np.count_nonzero((samples.v < low - margin) | (samples.v > high + margin))),
-        beyond=record_beyond(axis, run.t, samples.v),
+        beyond="; ".join(filter(None, [record_beyond(axis, run.t, samples.v), surroundings_beyond(axis, run.t)])),
         t=run.t,
         v=samples.v,
         measured=np.where(samples.fitted, samples.y, np.nan),

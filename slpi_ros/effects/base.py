@@ -4,7 +4,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import wraps
 from math import inf
-from typing import Any, ClassVar, Literal, Protocol, Self, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,6 +53,8 @@ class EffectContext:
     start: float | None = None
     # Voltage (V) at the piezo, shape (N,), for effects on the displacement; None: it rests.
     voltage: FloatArray | None = None
+    # Recorded quantities by name, shape (N,), in their units.
+    surroundings: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @classmethod
     def since_start(
@@ -85,6 +87,15 @@ class EffectContext:
         return (
             np.split(signal, np.cumsum([record.t.size for record in self.records[:-1]])) if self.records else [signal]
         )
+
+
+class Followed(NamedTuple):
+    """A recorded quantity that an effect follows: name, reference value, and recorded range, in its unit."""
+
+    key: str
+    reference: float
+    lowest: float
+    highest: float
 
 
 Effected = TypeVar("Effected")
@@ -137,6 +148,9 @@ class StreamingEffect(Streaming, Protocol):
     def reach(self, voltage: float) -> None:
         """Note the voltage (V) at the piezo for the next `forward`; called if the effect `needs_voltage`."""
 
+    def surround(self, key: str, value: float) -> None:
+        """Note the value of a recorded quantity for the next sample; called if the effect has `keys`."""
+
     def inverse(self, dt: float, wanted: float) -> float:
         """Return the input, or a stable approximation, for the output `wanted` after `dt` (s); keep the state."""
 
@@ -173,6 +187,9 @@ class StreamingBase:
     def reach(self, voltage: float) -> None:
         """Do nothing."""
 
+    def surround(self, key: str, value: float) -> None:
+        """Do nothing."""
+
     def snapshot(self) -> Any:
         """Return nothing."""
         return ()
@@ -204,6 +221,11 @@ class EffectBase(Protocol):
     dynamic: ClassVar[bool] = False
     # Whether a change of the sensitivity between records may be its doing.
     changes_gain: ClassVar[bool] = False
+    # Whether it follows recorded quantities.
+    follows_quantities: ClassVar[bool] = False
+    # Effects that follow time alone: it counts only beside its `confounders`, which they contain, and then they are no
+    # alternatives.
+    proved_beside: ClassVar[tuple[str, ...]] = ()
     # Effect that it resembles if it continues from long before a record.
     resembles_when_old: ClassVar[str] = ""
 
@@ -229,6 +251,10 @@ class EffectBase(Protocol):
     def in_phase(self, context: "FitContext") -> bool:
         """Return whether one set of parameters can hold for all records of a fit, and for others."""
         return True
+
+    def confounders(self, context: "ResidualContext") -> FloatArray:
+        """Return signals (m, (N, k)) that others may add, beside which it has to prove itself; of most effects none."""
+        return np.empty((context.t.size, 0))
 
     @property
     def at_bound(self) -> bool:
@@ -307,6 +333,11 @@ class EffectBase(Protocol):
         """The effect as it is after its record; None if it ends with it."""
         return None if self.side == "record" else self  # type: ignore[return-value]
 
+    @property
+    def anew(self) -> Self:
+        """The effect for another fit, without what it knows of the records of this one."""
+        return self
+
     def of_record(self, k: int) -> "Effect":
         """Return the effect as it is on the record of number `k` of those that it was fitted to."""
         return self  # type: ignore[return-value]
@@ -330,6 +361,24 @@ class EffectBase(Protocol):
     def settling_time(self) -> float:
         """Time (s) after which the piezo has the voltage of the command."""
         return abs(self.shift)
+
+    @property
+    def followed(self) -> "tuple[Followed, ...]":
+        """Recorded quantities that it follows; of most effects none."""
+        return ()
+
+    @property
+    def keys(self) -> tuple[str, ...]:
+        """Names of the recorded quantities that it follows."""
+        return tuple(one.key for one in self.followed)
+
+    def averaged(self, seconds: Mapping[str, float]) -> Self:
+        """Return the effect with the time constants (s) of the means of its quantities, by name, that are taken."""
+        return self
+
+    def only(self, keys: Sequence[str]) -> "Effect | None":
+        """Return the effect with some of the quantities that it follows; None without any."""
+        return None
 
     @property
     def coupling(self) -> Mapping[str, float]:

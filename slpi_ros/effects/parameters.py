@@ -44,6 +44,8 @@ class Fit:
     size: bool = False
     # Whether it is the state at the start of each record; an entry that is 0 stays 0.
     start: bool = False
+    # Whether 0 means that there is none, which stays so.
+    absent: bool = False
 
 
 @dataclass(frozen=True)
@@ -95,6 +97,11 @@ def parameter(
     return field(default=default, metadata={"parameter": Parameter(unit, meaning, low, high, must, **facts)})
 
 
+def text(meaning: str, *, default: Any = MISSING) -> Any:
+    """Return a dataclass field with a name, such as that of a topic; documents must contain it without a default."""
+    return field(default=default, metadata={"text": meaning})
+
+
 def _facts_of(kind: Any) -> dict[str, Parameter]:
     """Return the facts of the parameters of a kind of effect, or of the elements of a list in one, by field."""
     return {item.name: item.metadata["parameter"] for item in fields(kind) if "parameter" in item.metadata}
@@ -112,9 +119,9 @@ class Leaf(NamedTuple):
 
     @property
     def free(self) -> bool:
-        """Whether it is fitted: a limit that is not there, or an equilibrium at the start, stays as it is."""
+        """Whether it is fitted: what is not there, or an equilibrium at the start, stays as it is."""
         fit = self.facts.fit
-        return fit is not None and isfinite(self.value) and (bool(self.value) or not fit.start)
+        return fit is not None and isfinite(self.value) and (bool(self.value) or not (fit.start or fit.absent))
 
 
 def leaves(place: str, facts: Parameter, value: Any) -> Iterator[Leaf]:

@@ -21,6 +21,7 @@ MODULES = (
     "contact",
     "resonance",
     "self_heating",
+    "surroundings",
     "gain_drift",
     "cross_coupling",
     "thermal_drift",
@@ -32,6 +33,11 @@ MODULES = (
 EFFECTS: dict[str, type[Any]] = {
     name: getattr(import_module(f"slpi_ros.effects.{name}"), name.title().replace("_", "")) for name in MODULES
 }
+
+
+def base_name(label: str) -> str:
+    """Return the name of the effect of an alternative, such as ``surroundings /room/temperature``."""
+    return label.partition(" ")[0]
 
 
 def in_order(effects: Iterable[Effect]) -> tuple[Effect, ...]:
@@ -75,7 +81,7 @@ def _plain(value: Any) -> Any:
         return dict(value)
     if isinstance(value, tuple):
         return [_plain(one) for one in value]
-    return None if isinf(value) else value
+    return None if isinstance(value, float) and isinf(value) else value
 
 
 def _built(effect: str, what: str, kind: Any, value: Any) -> dict[str, Any]:
@@ -97,6 +103,10 @@ def _read(effect: str, what: str, kind: Any, value: Any, default: Any = MISSING)
         return tuple(_read(effect, f"{what}.{k}", get_args(kind)[0], each) for k, each in enumerate(value))
     if holds is Mapping:
         return {str(key): _number(effect, what, each) for key, each in _mapping(effect, what, value).items()}
+    if holds is str:
+        if not isinstance(value, str):
+            raise ModelError(f"effect '{effect}': {what} is of type {type(value).__name__}; give a text")
+        return value
     if is_dataclass(holds):
         return kind(**_built(effect, what, kind, value))
     return default if value is None and isinstance(default, float) else _number(effect, what, value)

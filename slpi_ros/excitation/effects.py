@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from slpi_ros.effects.excitation import MEAN_SPEED, WIPED, Excitation, safe_duration
-from slpi_ros.effects.registry import EFFECTS
+from slpi_ros.effects.registry import EFFECTS, base_name
 from slpi_ros.errors import UsageError
 from slpi_ros.excitation.legs import DriveSpec, Path
 
@@ -30,6 +30,7 @@ def effect_path(name: str, spec: DriveSpec) -> Path:
 
 def separating(names: Sequence[str]) -> str:
     """Return the effect whose drive separates ambiguous effects (likeliest first): the first one if none does."""
+    names = [base_name(name) for name in names]
     owners = [
         name for name in EFFECTS if name in names and not set(names).isdisjoint(EFFECTS[name].excitation.separates)
     ]

@@ -139,12 +139,12 @@ class Judged:
     model: str = ""
 
 
-def examine(bag: Bag, topic: str) -> Examined:
-    """Read a bag and assess the quality of its record; `topic` holds voltage and displacement."""
+def examine(bag: Bag, reading: Source) -> Examined:
+    """Read a bag and assess the quality of its record; `reading` names topics, and this bag is its only one."""
     began = time.process_time()
     try:
         with _quiet():
-            source = Source((bag.path,), topic)
+            source = replace(reading, bags=(bag.path,), surroundings=())
             (record,) = source.read()
             assessed = assess_record(record, source)
     except Exception as error:
@@ -164,16 +164,17 @@ def examine(bag: Bag, topic: str) -> Examined:
     )
 
 
-def identify_bag(one: Examined, topic: str, output: str, name: str) -> Judged:
+def identify_bag(one: Examined, reading: Source, output: str, name: str) -> Judged:
     """Identify the reference model of a stage from a bag, and write it to the file `name` in the folder `output`."""
     began = time.process_time()
     rows, axes = [], {}
     try:
         with _quiet():
-            (record,) = Source((one.bag.path,), topic).read()
+            (record,) = replace(reading, bags=(one.bag.path,), surroundings=reading.surroundings or ()).read()
             for axis in one.axes:
                 try:
-                    axes[axis] = identify(IdentifyRequest(_examined(record, (axis,)))).model.axes[axis]
+                    source = replace(_examined(record, (axis,)), surroundings=reading.surroundings)
+                    axes[axis] = identify(IdentifyRequest(source)).model.axes[axis]
                 except SlpiError as error:
                     rows.append(replace(one.row(axis), error=str(error)))
             if axes:
@@ -189,12 +190,12 @@ def identify_bag(one: Examined, topic: str, output: str, name: str) -> Judged:
     return Judged(_timed(rows, one, began), unexplained, name if axes else "")
 
 
-def compare(one: Examined, topic: str, output: str, reference: str, name: str) -> Judged:
+def compare(one: Examined, reading: Source, output: str, reference: str, name: str) -> Judged:
     """Verify the stage's model `reference` on a bag, and write a refitted one, `name`, where it is beyond the limit."""
     began = time.process_time()
     try:
         with _quiet():
-            record = _read(one, topic)
+            record = _read(one, reading)
             model = _model(output, reference)
             shared = [axis for axis in one.axes if axis in model.axes]
             rows = [
@@ -220,7 +221,7 @@ def compare(one: Examined, topic: str, output: str, reference: str, name: str) -
 def explain(
     one: Examined,
     rows: Sequence[Row],
-    topic: str,
+    reading: Source,
     output: str,
     reference: str,
     name: str,
@@ -234,7 +235,7 @@ def explain(
     told = []
     try:
         with _quiet():
-            record = _read(one, topic)
+            record = _read(one, reading)
             for row in rows:
                 told.append(_like_another(row, record, others, output) if row.verdict == FAILED else row)
             model = _model(output, reference)
@@ -276,9 +277,9 @@ def plain_name(stage: str) -> str:
     return name or "unnamed"
 
 
-def _read(one: Examined, topic: str) -> Record:
+def _read(one: Examined, reading: Source) -> Record:
     """Return the record of a bag, under the name of its stage."""
-    return _of_stage(Source((one.bag.path,), topic).read()[0], one.stage)
+    return _of_stage(replace(reading, bags=(one.bag.path,)).read()[0], one.stage)
 
 
 def _verification(record: Record, model: StageModel, axes: Sequence[str]) -> Verification:

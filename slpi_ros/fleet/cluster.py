@@ -24,6 +24,7 @@ from slpi_ros.identification.progress import report_progress
 from slpi_ros.io.bag_files import PATIENCE
 from slpi_ros.model.document import format_model, save_model
 from slpi_ros.model.stage_model import StageModel
+from slpi_ros.workflows.records import Source
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -69,6 +70,7 @@ def run(
     diagnose: bool = True,  # the causes of errors that no change of gain, width or zero explains
     watch: bool = False,  # continue with bags that are completed later, until interrupted
     topic: str = "stage_state",
+    surroundings: Sequence[str] | None = None,  # recorded quantities, TOPIC[:FIELD]; default: for a diagnosis all
     told: Callable[[str], None] | None = None,  # receives sentences about the cluster
     finished: Callable[[Results], None] | None = None,  # called whenever the table has been written
 ) -> "pd.DataFrame":
@@ -85,7 +87,7 @@ def run(
         raise UsageError(f"workers is {workers}; give at least 1")
     if scheduler is not None:
         _require_address(scheduler)
-    options = {"topic": topic, "diagnose": diagnose}
+    options = {"topic": topic, "diagnose": diagnose} | ({"with": list(surroundings)} if surroundings else {})
     earliest = _nanoseconds(since)
     given = load_models(models)
     found = find_bags(sources)
@@ -99,7 +101,7 @@ def run(
             _keep_given(results, stage, model)
         cluster = stack.enter_context(_connected(client, scheduler, workers, told or _silent))
         cluster.require_shared(results.folder, found[:1])
-        work = _Fleet(results, cluster, topic, earliest, diagnose, finished)
+        work = _Fleet(results, cluster, Source((), topic, surroundings=surroundings), earliest, diagnose, finished)
         try:
             while True:
                 now = time.time()
@@ -124,12 +126,12 @@ class _Fleet:
         self,
         results: Results,
         cluster: "_Cluster",
-        topic: str,
+        reading: Source,
         earliest: int | None,
         diagnosed: bool,
         finished: Callable[[Results], None] | None,
     ) -> None:
-        self._results, self._cluster, self._topic = results, cluster, topic
+        self._results, self._cluster, self._reading = results, cluster, reading
         self._earliest, self._diagnosed, self._finished = earliest, diagnosed, finished
         self._next_table = time.monotonic() + WRITE
         self._total = 0
@@ -183,7 +185,7 @@ class _Fleet:
             self._results.add_examined(one)
             return ()
 
-        return Task(Examined(bag, bag.stage), bags.examine, (bag, self._topic), finish)
+        return Task(Examined(bag, bag.stage), bags.examine, (bag, self._reading), finish)
 
     def _stage_tasks(self, waiting: Sequence[Examined]) -> Iterator[Task]:
         """Yield the first tasks of every stage: comparisons with its reference, or the identification of one."""
@@ -209,12 +211,12 @@ class _Fleet:
             return self._next_of_stage(queue[1:])
 
         name = bags.model_name(first)
-        arguments = (first, self._topic, str(self._results.folder), name)
+        arguments = (first, self._reading, str(self._results.folder), name)
         yield Task(first, bags.identify_bag, arguments, finish)
 
     def _comparison(self, one: Examined) -> Task:
         reference = self._state.references[one.stage]
-        arguments = (one, self._topic, str(self._results.folder), reference, bags.model_name(one))
+        arguments = (one, self._reading, str(self._results.folder), reference, bags.model_name(one))
         return Task(one, bags.compare, arguments, lambda judged: self._keep(one, judged))
 
     def _explanation(self, path: str) -> Task:
@@ -222,7 +224,7 @@ class _Fleet:
         others = {stage: model for stage, model in sorted(self._state.references.items()) if stage != one.stage}
         reference = self._state.references.get(one.stage) if one.stage else None
         reference = reference or self._state.judged[path].model
-        known = (one, rows, self._topic, str(self._results.folder), reference, bags.model_name(one), others)
+        known = (one, rows, self._reading, str(self._results.folder), reference, bags.model_name(one), others)
         # It may take minutes.
         arguments = (*known, self._diagnosed)
         return Task(one, bags.explain, arguments, lambda judged: self._keep(one, judged), alone=True)

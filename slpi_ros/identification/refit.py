@@ -102,7 +102,8 @@ def refit(
     shared = [axis for axis in model.axes if axis in (axes or record.axes)]
     if not shared:
         raise UsageError(f"{record.source} holds none of the model's axes {', '.join(model.axes)}")
-    applied, record = record, _without_effects(model.stage_only, model.correct(record), shared)
+    surrounded = model.stage_only.surrounded(record)
+    applied, record = record, _without_effects(surrounded, model.correct(record), shared)
     updated, changes = dict(model.axes), {}
     for name in shared:
         where = f"{record.source}: axis '{name}': "

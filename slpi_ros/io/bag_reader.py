@@ -5,6 +5,7 @@ import os
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -13,19 +14,26 @@ from numpy.typing import NDArray
 from rosbags.rosbag2 import Reader
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.io.alignment import SeparateTopics, Signals, combine
 from slpi_ros.io.bag_files import absolute_name, locate, match_topic, require_bounded, translated, unpacked
 from slpi_ros.io.bag_storage import MessageBlock, read_mcap, read_sqlite
 from slpi_ros.io.input_limits import MOST_AXES, require_count
-from slpi_ros.io.messages import JOINT_STATE, MESSAGE_TYPES, SECOND_NS, Message, read_message
-from slpi_ros.io.record import BLOCK, Record, each_block, first_step_back, new_column, release
+from slpi_ros.io.messages import JOINT_STATE, MESSAGE_TYPES, QUANTITY_TYPES, SECOND_NS, Message, kind_of, read_message
+from slpi_ros.io.record import BLOCK, Course, Record, each_block, first_step_back, new_column, release
+from slpi_ros.io.surroundings import MOST, Chosen, courses, since_start_of, topics_beside
 
 _Path = str | os.PathLike[str]
 
 
-def read_bag(path: _Path, topic: str | SeparateTopics = "stage_state", *, axes: Sequence[str] | None = None) -> Record:
-    """Read voltage and displacement of a stage from a bag.
+def read_bag(
+    path: _Path,
+    topic: str | SeparateTopics = "stage_state",
+    *,
+    axes: Sequence[str] | None = None,
+    surroundings: Sequence[str] | None = None,
+) -> Record:
+    """Read voltage and displacement of a stage from a bag, and the quantities that were recorded beside them.
 
     Parameters
     ----------
@@ -36,6 +44,11 @@ def read_bag(path: _Path, topic: str | SeparateTopics = "stage_state", *, axes: 
         voltage and displacement. The leading slash and the namespace may be omitted if the name is unambiguous.
     axes : sequence of str, optional
         The axes to read, in this order; default: all axes that the messages name.
+    surroundings : sequence of str, optional
+        The quantities to read, ``topic`` or ``topic:field``; default: every ``sensor_msgs/Temperature``,
+        ``RelativeHumidity``, ``FluidPressure``, ``std_msgs/Float64`` and ``geometry_msgs/WrenchStamped`` that is none
+        of the stage's own topics, and joint states of other stages. Fields are ``force.z`` of a wrench and
+        ``position.x`` of a joint state.
 
     Returns
     -------
@@ -54,9 +67,15 @@ def read_bag(path: _Path, topic: str | SeparateTopics = "stage_state", *, axes: 
         if isinstance(topic, SeparateTopics):
             voltage = bag.read(topic.voltage, MESSAGE_TYPES)
             displacement = bag.read(topic.displacement, MESSAGE_TYPES)
-            return combine(voltage, displacement, topic, axes or (), path)
+            record = combine(voltage, displacement, topic, axes or (), path)
+            taken = [bag.full_name(name) for name in (topic.displacement, topic.voltage)]
+            return _with_surroundings(record, bag, displacement, taken, surroundings)
         state = bag.read(topic, (JOINT_STATE,))
-    chosen = _choose_axes(state, axes, f"{path}, topic '{topic}'")
+        record = _record_of(state, _choose_axes(state, axes, f"{path}, topic '{topic}'"), path)
+        return _with_surroundings(record, bag, state, [bag.full_name(topic)], surroundings)
+
+
+def _record_of(state: Signals, chosen: Sequence[str], path: Path) -> Record:
     return Record(
         time_ns=state.logged if state.stamp is None else state.stamp,
         voltage={axis: state.fields["effort"][axis] for axis in chosen},
@@ -65,6 +84,39 @@ def read_bag(path: _Path, topic: str | SeparateTopics = "stage_state", *, axes: 
         hardware_id=state.frame_id,
         notes=() if state.stamp is not None else ("time is that of recording: the messages are not stamped",),
     )
+
+
+def _with_surroundings(
+    record: Record, bag: "Bag", state: Signals, taken: Sequence[str], wanted: Sequence[str] | None
+) -> Record:
+    """Return the record with the `wanted` quantities, default: all; what is not wanted by name may be unreadable."""
+    # `state` gives the clock of the record; of the topics `taken` the first is that of the stage.
+    if wanted is None:
+        beside = [topic for topic in topics_beside(bag.types, taken[0]) if topic not in taken]
+        chosen = [Chosen(topic, "") for topic in beside if bag.holds(topic)]
+    else:
+        chosen = [Chosen.of(text) for text in wanted]
+    if not (chosen and record.time_ns.size):
+        return record
+    found: dict[str, Course] = {}
+    unread = []
+    for topic, field in chosen:
+        try:
+            full, signals = bag.full_name(topic), bag.read(topic, QUANTITY_TYPES)
+            since_start = since_start_of(signals, int(record.time_ns[0]), state)
+            found |= courses(signals, Chosen(full, field), bag.types[full], since_start)
+        except SlpiError as error:
+            if wanted is not None:
+                where = f"{record.source}: "
+                raise type(error)(where + str(error).removeprefix(where)) from None
+            unread.append(topic)
+    notes = list(record.notes)
+    if unread:
+        notes.append(f"not read: {', '.join(unread)}")
+    if wanted is None and len(found) > MOST:
+        notes.append(f"the first {MOST} of {len(found)} quantities are read; name others (--with)")
+        found = dict(list(found.items())[:MOST])
+    return replace(record, surroundings=found, notes=tuple(notes))
 
 
 def require_different(paths: Iterable[_Path]) -> list[Path]:
@@ -144,6 +196,15 @@ class Bag:
             raise RecordError(f"{self._path}: no message on topic '{topic}'; was the stage's driver running?")
         return signals
 
+    @property
+    def types(self) -> Mapping[str, str]:
+        """Message types by full name of the topic."""
+        return self._topics
+
+    def full_name(self, topic: str) -> str:
+        """Return the full name of a topic."""
+        return match_topic(self._topics, topic, tuple(self._topics.values()), self._path)
+
     def type_of(self, topic: str, msgtypes: Collection[str]) -> str:
         """Return the message type of a topic, which must be one of these."""
         return self._topics[match_topic(self._topics, topic, tuple(msgtypes), self._path)]
@@ -151,7 +212,7 @@ class Bag:
     def messages(self, topic: str) -> Iterator[tuple[int, bytes]]:
         """Yield the messages of a topic, each with its recording time (ns)."""
         with translated(self._path):
-            for block in self._blocks(match_topic(self._topics, topic, tuple(self._topics.values()), self._path)):
+            for block in self._blocks(self.full_name(topic)):
                 yield from zip(block.logged.tolist(), block.each(), strict=True)
 
     def _blocks(self, topic: str) -> Iterator[MessageBlock]:
@@ -194,7 +255,7 @@ def decode_signals(blocks: Iterable[MessageBlock], msgtype: str, expected: int =
         order = np.argsort(logged, kind="stable")
         arrays = {key: array[order] for key, array in arrays.items()}
         logged, stamp = arrays[_LOGGED], arrays[_STAMP]
-    kind = MESSAGE_TYPES[msgtype]
+    kind = kind_of(msgtype)
     fields: dict[str, dict[str, FloatArray]] = {field: {} for field in kind.fields}
     for (field, name), array in arrays.items():
         if field:
@@ -272,7 +333,7 @@ def _each(block: MessageBlock, msgtype: str, messages: Sequence[Message]) -> _Pa
     names = dict.fromkeys(name for message in messages for name in message.names)
     require_count(len(names), MOST_AXES, "names")
     for name in names:
-        columns |= {(field, name): np.full(len(messages), np.nan) for field in MESSAGE_TYPES[msgtype].fields}
+        columns |= {(field, name): np.full(len(messages), np.nan) for field in kind_of(msgtype).fields}
     for row, message in enumerate(messages):
         for field, numbers in message.values.items():
             # zip stops at the shorter sequence: names beyond the end of an array have no value.

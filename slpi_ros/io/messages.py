@@ -48,6 +48,23 @@ def _read_vector(reader: CdrReader) -> tuple[str, ...]:
     return ("x", "y", "z")
 
 
+def _read_wrench(reader: CdrReader) -> tuple[str, ...]:
+    reader.doubles("force", 3)
+    reader.doubles("torque", 3)
+    return ("x", "y", "z")
+
+
+def _measured(field: str) -> "MessageType":
+    """Return the type of a stamped measurement, with a variance after its value."""
+
+    def read(reader: CdrReader) -> tuple[str, ...]:
+        reader.doubles(field, 1)
+        reader.doubles("variance", 1)
+        return ("0",)
+
+    return MessageType(True, False, (field,), read)
+
+
 @dataclass(frozen=True)
 class MessageType:
     """Rules for decoding one message type."""
@@ -57,6 +74,11 @@ class MessageType:
     fields: tuple[str, ...]  # that contain the numbers
     read: Callable[[CdrReader], tuple[str, ...]]  # everything after the header; returns the names of the columns
 
+    @property
+    def several(self) -> bool:
+        """Whether a message may hold several numbers."""
+        return self.named
+
 
 MESSAGE_TYPES = {
     JOINT_STATE: MessageType(True, True, ("position", "effort"), _read_joint_state),
@@ -64,6 +86,21 @@ MESSAGE_TYPES = {
     "std_msgs/msg/Float64MultiArray": MessageType(False, False, ("data",), _read_array),
     "geometry_msgs/msg/Vector3Stamped": MessageType(True, True, ("vector",), _read_vector),
 }
+# Types of quantities that are recorded beside a stage.
+QUANTITY_TYPES = {
+    "sensor_msgs/msg/Temperature": _measured("temperature"),
+    "sensor_msgs/msg/RelativeHumidity": _measured("relative_humidity"),
+    "sensor_msgs/msg/FluidPressure": _measured("fluid_pressure"),
+    "std_msgs/msg/Float64": MESSAGE_TYPES["std_msgs/msg/Float64"],
+    "geometry_msgs/msg/WrenchStamped": MessageType(True, True, ("force", "torque"), _read_wrench),
+    JOINT_STATE: MESSAGE_TYPES[JOINT_STATE],
+}
+_KINDS = MESSAGE_TYPES | QUANTITY_TYPES
+
+
+def kind_of(msgtype: str) -> MessageType:
+    """Return the rules for decoding one of the `MESSAGE_TYPES` or `QUANTITY_TYPES`."""
+    return _KINDS[msgtype]
 
 
 @dataclass(frozen=True)
@@ -83,8 +120,8 @@ class Message:
 
 
 def read_message(data: bytes, msgtype: str) -> Message:
-    """Decode a serialised message of one of the `MESSAGE_TYPES`; struct.error or UnicodeDecodeError if not valid."""
-    kind, reader = MESSAGE_TYPES[msgtype], CdrReader(data)
+    """Decode a serialised message of a type of `kind_of`; struct.error or UnicodeDecodeError if it is not valid."""
+    kind, reader = kind_of(msgtype), CdrReader(data)
     stamp_ns, frame_id = 0, ""
     if kind.stamped:
         stamp_ns = reader.integer("i", "sec") * SECOND_NS + reader.integer("I", "nanosec")

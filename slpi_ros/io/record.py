@@ -15,6 +15,8 @@ from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.input_limits import LONGEST_NAME, MOST_AXES
 
+# Times (s) from the first stamp of a record, ascending, and values of a quantity, NaN: no reading, shape (n,) each.
+Course = tuple[FloatArray, FloatArray]
 # Columns of this size and above, in bytes, are kept in a temporary file.
 MAPPED_FROM = 32 * 2**20
 # Number of samples of a block, where a long record is worked on in blocks.
@@ -87,6 +89,9 @@ class Record:
         Identifier of the stage, as given by its driver; "" if unknown.
     notes : tuple of str
         Remarks on how the record was made. Default none.
+    surroundings : mapping of str to (ndarray, ndarray), shape (n,) each
+        Quantities that were recorded beside it, by topic, or ``topic:field`` where a message has several: times (s)
+        from the first stamp, ascending, and values, NaN where there is none. Default none.
 
     Raises
     ------
@@ -100,6 +105,7 @@ class Record:
     source: str = "record"
     hardware_id: str = ""
     notes: tuple[str, ...] = ()
+    surroundings: Mapping[str, Course] = field(default_factory=dict)
     axes: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -122,6 +128,11 @@ class Record:
                         f"{self.source}: {name} of axis '{axis}' has {signal.shape} values "
                         f"for {self.time_ns.shape} stamps"
                     )
+        for name, (t, value) in self.surroundings.items():
+            if t.ndim != 1 or t.shape != value.shape:
+                raise RecordError(
+                    f"{self.source}: quantity '{name}' has {value.shape} values for {t.shape} times; give one for each"
+                )
         object.__setattr__(self, "axes", tuple(self.voltage))
 
     @property
@@ -134,7 +145,10 @@ class Record:
         voltage, displacement = (
             {axis: signal[rows] for axis, signal in signals.items()} for signals in (self.voltage, self.displacement)
         )
-        return replace(self, time_ns=self.time_ns[rows], voltage=voltage, displacement=displacement)
+        time_ns = self.time_ns[rows]
+        later = (time_ns[0] - self.time_ns[0]) * 1e-9 if time_ns.size else 0.0
+        beside = {name: (t - later, value) for name, (t, value) in self.surroundings.items()}
+        return replace(self, time_ns=time_ns, voltage=voltage, displacement=displacement, surroundings=beside)
 
     def __len__(self) -> int:
         return int(self.time_ns.size)

@@ -93,16 +93,27 @@ def _column_summary(column: Column, values: FloatArray, unit: str) -> str:
 
 def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Read times (s) and finite values (V or m) by axis, shape (N,) each, from a table of the command line."""
-    # The columns are ``time_s`` and ``<axis>_<suffix>``, "V" or "m", in any order; others are ignored.
+    t, by_axis, _ = read_table_with(path, suffix, ())
+    return t, by_axis
+
+
+def read_table_with(
+    path: str | os.PathLike[str], suffix: str, beside: Sequence[str]
+) -> tuple[FloatArray, dict[str, FloatArray], dict[str, FloatArray]]:
+    """Read times (s), finite values (V or m) by axis, and quantities by name, (N,) each, from a table of a command."""
+    # The columns are ``time_s``, ``<axis>_<suffix>``, "V" or "m", and of `beside` those that are there, in any order;
+    # others are ignored.
     table = load_csv(Path(path))
     ending = _ending(suffix)
-    columns = {n.removesuffix(ending): n for n in table.columns if n.endswith(ending) and n != ending}
+    own = [name for name in table.columns if name not in beside]
+    columns = {n.removesuffix(ending): n for n in own if n.endswith(ending) and n != ending}
     if not columns:
         raise RecordError(f"{path}: no column <axis>{ending}; there is {table.listing()}")
     if len(columns) > MOST_AXES:
         raise RecordError(f"{path}: {len(columns)} columns <axis>{ending}, more than {MOST_AXES} axes; leave some out")
     time = match_column("time_s", table.columns)
-    values = table.read((time, *columns.values()))
+    also = [name for name in beside if name in table.columns]
+    values = table.read((time, *columns.values(), *also))
     for column, samples in values.items():
         table.require(
             np.isfinite(samples),
@@ -111,7 +122,8 @@ def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, d
             "no finite number (an empty cell counts as nan); write one into every cell",
         )
     _require_order(values[time], time, table)
-    return values[time], {axis: values[column] for axis, column in columns.items()}
+    by_axis = {axis: values[column] for axis, column in columns.items()}
+    return values[time], by_axis, {name: values[name] for name in also}
 
 
 def write_table(path: str | os.PathLike[str], t: FloatArray, columns: Mapping[str, FloatArray], suffix: str) -> None:

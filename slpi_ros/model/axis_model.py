@@ -2,7 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import inf
 from typing import Literal
@@ -10,7 +10,7 @@ from typing import Literal
 import numpy as np
 
 from slpi_ros.arrays import FloatArray, Mask
-from slpi_ros.effects.base import Effect, EffectContext
+from slpi_ros.effects.base import Effect, EffectContext, Followed
 from slpi_ros.effects.chain import Chain, backward, forward, lasting
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import UnreachableError, UsageError
@@ -20,6 +20,7 @@ from slpi_ros.hysteresis.kinds import Hysteresis, PathModel
 from slpi_ros.hysteresis.reversals import require_finite
 from slpi_ros.hysteresis.shapes import FAR
 from slpi_ros.hysteresis.turning_points import Memory
+from slpi_ros.io.record import Course
 from slpi_ros.model.limits import Limits, decaying_turns
 from slpi_ros.model.sensor import IDEAL, Sensor, StreamingSensor
 from slpi_ros.model.streaming import ROUNDING, StreamingInverse, accepted_range, refusal
@@ -91,6 +92,9 @@ class AxisModel:
         kinds that are not causal.
     sensor : Sensor
         Known delay and lag of the sensor, taken out of measurements; default: none.
+    surroundings : mapping of str to (ndarray, ndarray), shape (n,) each
+        Times (s) and values of quantities that the stage follows, by name; of those that are not in it, and by default
+        of all, the reference values.
     """
 
     kind: str
@@ -102,6 +106,7 @@ class AxisModel:
     effects: tuple[Effect, ...] = ()
     end: Start | None = None
     sensor: Sensor = IDEAL
+    surroundings: Mapping[str, Course] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         rest = self.start.displacement
@@ -210,10 +215,34 @@ class AxisModel:
         if not self.effects:
             return self._path().forward_array(v)
         require_finite(v)
-        around = EffectContext.since_start(t, start=self.start.voltage)
+        around = self._around(t, start=self.start.voltage)
         applied, u, beside = chain.reaching(v, around)
         beside += self._path().forward_array(u)
         return forward(chain.own, beside, replace(around.driven(applied), start=self.start.displacement))
+
+    def _around(
+        self, t: FloatArray, others: Mapping[str, FloatArray] | None = None, start: float | None = None
+    ) -> EffectContext:
+        """Return the context of the effects at times `t`, shape (N,), seconds, on the clock of `surroundings`."""
+        around = EffectContext.since_start(t, others, start)
+        if not self.surroundings:
+            return around
+        return replace(around, surroundings={key: np.interp(t, *course) for key, course in self.surroundings.items()})
+
+    @property
+    def followed(self) -> tuple[Followed, ...]:
+        """Quantities that the stage follows."""
+        return tuple(one for effect in self.effects for one in effect.followed)
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """Names of the quantities that the stage follows."""
+        return tuple(one.key for one in self.followed)
+
+    def surrounded(self, courses: Mapping[str, Course]) -> "AxisModel":
+        """Return the model in surroundings; quantities that the stage does not follow are ignored."""
+        known = {key: course for key, course in courses.items() if key in self.quantities and course[0].size}
+        return replace(self, surroundings=known) if known or self.surroundings else self
 
     def seen(self, t: FloatArray, own: FloatArray, others: Mapping[str, FloatArray]) -> FloatArray:
         """Return what the sensor says, shape (N,), metres, at times `t` (s) for a result of `uncoupled_displacement`.
@@ -223,7 +252,7 @@ class AxisModel:
         return self._seen(self.chain, t, own, others)
 
     def _seen(self, chain: Chain, t: FloatArray, own: FloatArray, others: Mapping[str, FloatArray]) -> FloatArray:
-        around = EffectContext.since_start(t, others)
+        around = self._around(t, others)
         return self.sensor.apply(t, forward((*chain.shared, *chain.measured), own, around))
 
     @property
@@ -306,11 +335,23 @@ class AxisModel:
         It is that of `stream`, but for a delay, which is compensated by preview, and for models that are not causal.
         `coupled` (m), a number or of shape (N,), is the displacement that other axes add.
         """
-        allowed, around = self._allowed(limits), EffectContext.since_start(t)
+        allowed, around = self._allowed(limits), self._around(t)
         if not self.causal and max(allowed.slew, allowed.acceleration) == inf and not self.chain.around:
             return self._command_known_path(y - coupled, around, allowed, self.initial(start_memory))
+        timed = self._timed
+        if timed and self.surroundings:
+            # They depend on time alone, and what comes after them is constant: undone for the whole path at once.
+            y, coupled = backward(timed, y - coupled, around), 0.0
+            rest = tuple(effect for effect in self.effects if effect not in timed)
+            self = replace(self, effects=rest)
         v, held = self.stream(limits, start_memory).run(t, y, coupled)
         return backward([effect for effect in self.chain.before if effect.shift], v, around), held
+
+    @property
+    def _timed(self) -> tuple[Effect, ...]:
+        """Effects on the axis itself from that on which follows recorded quantities."""
+        own = self.chain.own
+        return next((own[place:] for place, effect in enumerate(own) if effect.keys), ())
 
     def _command_known_path(
         self, y: FloatArray, around: EffectContext, allowed: Limits, start: Start

@@ -32,6 +32,23 @@ def record_beyond(axis: AxisModel, t: FloatArray, v: FloatArray) -> str:
     return _beyond("this record", fastest(t, v), v, axis.quality.fastest, axis.voltage_range, "V")
 
 
+def surroundings_beyond(axis: AxisModel, t: FloatArray) -> str:
+    """Return which quantities are not known at times `t` (s), (N,), or beyond what was recorded; else ""."""
+    told = []
+    for one in axis.followed:
+        course = axis.surroundings.get(one.key)
+        if course is None:
+            told.append(f"{one.key} is not known and taken as {one.reference:.4g}")
+            continue
+        value, margin = np.interp(t, *course), WIDER * (one.highest - one.lowest)
+        if value.min() < one.lowest - margin or value.max() > one.highest + margin:
+            told.append(
+                f"{one.key} goes from {value.min():.4g} to {value.max():.4g}, in the record of the model from "
+                f"{one.lowest:.4g} to {one.highest:.4g}"
+            )
+    return "; ".join(told)
+
+
 def _beyond(
     what: str, rate: float, x: FloatArray, known_rate: float | None, known: tuple[float, float], unit: str
 ) -> str:

@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.io.record import Record
+from slpi_ros.io.surroundings import smoothed
 from slpi_ros.model.axis_model import AxisModel, StartMemory
 from slpi_ros.model.coupling import Coupling
 from slpi_ros.model.limits import Limits
@@ -47,7 +48,7 @@ class StageModel:
             raise UsageError(f"the model has no axis '{name}'; it holds {', '.join(self.axes)}")
         return self.axes[name]
 
-    def simulate(self, t: ArrayLike, v: Signal) -> Any:
+    def simulate(self, t: ArrayLike, v: Signal, surroundings: Mapping[str, ArrayLike] | None = None) -> Any:
         """Return what the sensors will say for a voltage signal, free-run from the initial state of the record.
 
         Effects of the stage and of its sensors act; drift and lines of the record do not. SlpiError if axes, lengths or
@@ -59,6 +60,9 @@ class StageModel:
             Not decreasing.
         v : array_like, shape (N,), or mapping of axis name to array_like, shape (N,), volts
             An array without axis name is allowed for a model with one axis.
+        surroundings : mapping of str to array_like, shape (N,), optional
+            Values of the quantities that the stage follows, by name, in their units; those left out, and by default
+            all, have their reference values.
 
         Returns
         -------
@@ -66,6 +70,8 @@ class StageModel:
             In the form of `v`.
         """
         time, voltage = self._signals(t, v, "voltage")
+        if surroundings:
+            return self.within(time, surroundings).simulate(time, v)
         own: dict[str, FloatArray] = {}
         for name, signal in voltage.items():
             with _naming(name, "voltage"):
@@ -74,7 +80,13 @@ class StageModel:
         seen = {name: self.axes[name].seen(time, y, motions) for name, y in own.items()}
         return seen if isinstance(v, Mapping) else next(iter(seen.values()))
 
-    def compensate(self, t: ArrayLike, y: Signal, start_memory: StartMemory = "end") -> Any:
+    def compensate(
+        self,
+        t: ArrayLike,
+        y: Signal,
+        start_memory: StartMemory = "end",
+        surroundings: Mapping[str, ArrayLike] | None = None,
+    ) -> Any:
         """Return the voltage for a desired displacement of the stage, from an assumed initial state.
 
         Only effects of the stage are inverted. Without effects of sensor and record, this is the inverse of `simulate`.
@@ -88,6 +100,8 @@ class StageModel:
             Where the stage shall be.
         start_memory : str
             Assumed initial state, `AxisModel.initial`: ``end`` (default) or ``start`` of the record, or ``wiped``.
+        surroundings : mapping of str to array_like, shape (N,), optional
+            As for `simulate`.
 
         Returns
         -------
@@ -95,7 +109,7 @@ class StageModel:
             In the form of `y`, within the identified voltage range. For displacements slightly outside the reachable
             range the voltage is held at the limit, with a `HeldAtLimitWarning`.
         """
-        answers = self.command(t, y, start_memory=start_memory)
+        answers = self.command(t, y, start_memory=start_memory, surroundings=surroundings)
         for _, held in answers.values():
             if held.any():
                 warnings.warn(held_message(held), HeldAtLimitWarning, stacklevel=2)
@@ -103,7 +117,12 @@ class StageModel:
         return voltage if isinstance(y, Mapping) else next(iter(voltage.values()))
 
     def command(
-        self, t: ArrayLike, y: Signal, limits: Limits | None = None, start_memory: StartMemory = "end"
+        self,
+        t: ArrayLike,
+        y: Signal,
+        limits: Limits | None = None,
+        start_memory: StartMemory = "end",
+        surroundings: Mapping[str, ArrayLike] | None = None,
     ) -> dict[str, tuple[FloatArray, Mask]]:
         """Return by axis the voltage (V), as `compensate`, and where it is held at a limit, shape (N,) each.
 
@@ -111,6 +130,8 @@ class StageModel:
         acceleration limit the voltage is that of `streams`: it begins at the voltage of the start memory.
         """
         time, desired = self._signals(t, y, "displacement")
+        if surroundings:
+            return self.within(time, surroundings).command(time, y, limits, start_memory)
         for name, signal in desired.items():
             with _naming(name, "displacement"):
                 self.axis(name).require_reachable(signal)
@@ -136,6 +157,31 @@ class StageModel:
         See `AxisModel.correct`; axes that are not in the model, or not in the record, are unchanged.
         """
         return corrected(record, {name: axis.correct for name, axis in self.axes.items() if axis.corrects})
+
+    @property
+    def quantities(self) -> tuple[str, ...]:
+        """Names of the quantities that an axis follows."""
+        return tuple(dict.fromkeys(key for axis in self.axes.values() for key in axis.quantities))
+
+    def surrounded(self, record: Record) -> "StageModel":
+        """Return the model in the surroundings of a record, on its clock; reference values where it has none."""
+        courses = {key: smoothed(record.surroundings[key]) for key in self.quantities if key in record.surroundings}
+        return replace(self, axes={name: axis.surrounded(courses) for name, axis in self.axes.items()})
+
+    def within(self, t: FloatArray, surroundings: Mapping[str, ArrayLike]) -> "StageModel":
+        """Return the model in surroundings, (N,) each, at times `t` (s); UsageError if it does not follow one."""
+        courses = {}
+        for key, values in surroundings.items():
+            if key not in self.quantities:
+                follows = f"it follows {', '.join(self.quantities)}" if self.quantities else "it follows none"
+                raise UsageError(f"the stage does not follow '{key}'; {follows}; leave it out")
+            value = _as_array(values, f"'{key}'")
+            if value.shape != t.shape or not np.isfinite(value).all():
+                raise UsageError(
+                    f"'{key}' has shape {value.shape}, time has {t.shape}; give one finite value for each time"
+                )
+            courses[key] = t, value
+        return replace(self, axes={name: axis.surrounded(courses) for name, axis in self.axes.items()})
 
     def shifted(self, offsets: Mapping[str, float]) -> "StageModel":
         """Return the model with zeros that have moved by `offsets` (m, by axis)."""

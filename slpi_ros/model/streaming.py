@@ -62,6 +62,7 @@ class StreamingInverse:
         # Effects after the hysteresis that follow the voltage, too.
         needing = [effect.name for effect in chain.own if effect.needs_voltage]
         self._driven = tuple(self._behind[name] for name in needing if name in self._behind)
+        self._following = tuple(self._behind[effect.name] for effect in chain.own if effect.keys)
         # Only the hysteresis, and what is around it: the command alone determines where the axis is.
         self._direct = not (self._before or self._behind)
         self._alone = not (chain.before or chain.own or chain.shared)
@@ -151,6 +152,12 @@ class StreamingInverse:
             return v >= limits.upper - ROUNDING * (1.0 + abs(limits.upper))
         return max(missing, short) < 0.0 and v <= limits.lower + ROUNDING * (1.0 + abs(limits.lower))
 
+    def surround(self, values: Mapping[str, float]) -> None:
+        """Note values of quantities, by name, for the next sample; what the stage does not follow is ignored."""
+        for key, value in values.items():
+            for streaming in self._following:
+                streaming.surround(key, value)
+
     def check(self, t: float, y: float) -> None:
         """Raise the error that `step` would raise for `t` (s) and `y` (m), without a change of state."""
         if not (isfinite(t) and isfinite(y)):
@@ -160,8 +167,13 @@ class StreamingInverse:
         if not self._lowest <= y <= self._highest:
             raise UnreachableError(refusal(y, self.accepted))
 
-    def step(self, t: float, y: float) -> float:
-        """Return the voltage (V) for the desired displacement `y` (m) at time `t` (s); errors as in `check`."""
+    def step(self, t: float, y: float, surroundings: Mapping[str, float] | None = None) -> float:
+        """Return the voltage (V) for the desired displacement `y` (m) at time `t` (s); errors as in `check`.
+
+        `surroundings` are new values of quantities that the stage follows, by name; others stay as they were.
+        """
+        if surroundings:
+            self.surround(surroundings)
         if not (self._t <= t < inf and self._lowest <= y <= self._highest):
             self.check(t, y)
         if self._free:
@@ -346,8 +358,8 @@ class StreamingInverse:
         other = copy(self)
         other.memory, other.pace = copy(self.memory), self.pace.copy()
         other.memory.restore(self.memory.snapshot())
-        own = self._before, self._around, self._behind, self._driven
-        other._before, other._around, other._behind, other._driven = deepcopy(own)
+        own = self._before, self._around, self._behind, self._driven, self._following
+        other._before, other._around, other._behind, other._driven, other._following = deepcopy(own)
         return other
 
     def _move(self, dt: float, elapsed: float, h: float, now_ns: int) -> float:

@@ -1,6 +1,7 @@
 """Start, spin and stop a node: functions shared by all executables."""
 
 import ctypes
+import importlib
 import os
 import signal
 import sys
@@ -26,7 +27,7 @@ from rclpy.utilities import ok, try_shutdown
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
 
-from slpi_ros.errors import SlpiError, UsageError, shown
+from slpi_ros.errors import RecordError, SlpiError, UsageError, shown
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.nodes import stop
 from slpi_ros.nodes.stop import SIGNALS, Stop
@@ -98,6 +99,17 @@ def _refusing(node: LifecycleNode, change_state: Any) -> Any:
             return response
 
     return on_request
+
+
+def message_class(topic: str, msgtype: str) -> Any:
+    """Return the class of a message type; RecordError, which names the topic, if it is not installed."""
+    package, kind, name = msgtype.split("/")
+    try:
+        return getattr(importlib.import_module(f"{package}.{kind}"), name)
+    except (ImportError, AttributeError) as error:
+        raise RecordError(
+            f"{topic} is {msgtype}, which is not installed; source its workspace or omit the topic"
+        ) from error
 
 
 def publishers_beside(node: Node, topic: str) -> list[str]:

@@ -51,6 +51,7 @@ from slpi_ros.nodes.compensator_diagnostics import Reporter
 from slpi_ros.nodes.compensator_parameters import DECLARATIONS, CompensatorSettings
 from slpi_ros.nodes.jobs import Read, Reading
 from slpi_ros.nodes.parameters import Parameters
+from slpi_ros.nodes.surroundings import SurroundingsTopics
 
 # Minimum time between two log messages of the same kind, seconds.
 LOG_PERIOD, FILE_LOG_PERIOD = 5.0, 60.0
@@ -64,6 +65,8 @@ OVERRIDABLE = QoSOverridingOptions.with_default_policies()
 OLDEST_NS, EARLIEST_NS = SECOND_NS // 5, SECOND_NS // 20
 # While voltages are output, reports of the amplifiers are looked at once in this time.
 REPORT_NS = SECOND_NS // 200
+# Time between two looks for topics of quantities and their age.
+SURROUNDINGS_NS = SECOND_NS // 2
 # Time from the start of the node within which publishers of stage_state are discovered; polling period, seconds.
 # The middleware repeats what a busy machine has missed of its discovery after 3 s.
 DISCOVERY_NS, DISCOVERY_POLL = 7 * SECOND_NS // 2, 0.005
@@ -77,8 +80,9 @@ class Compensator(LifecycleNode):
     """Lifecycle node that publishes the voltages of all axes for every message with desired displacements.
 
     Subscribes to ``desired_displacement``, ``desired_trajectory``, ``measured_displacement``, ``stage_state``,
-    ``stage_model`` and ``voltage_trajectory_state``, publishes ``voltage_command``, ``voltage_trajectory``,
-    ``tracking_error`` and ``/diagnostics``, provides the services ``~/reset_memory``, ``~/set_zero`` and ``~/arm``.
+    ``stage_model``, ``voltage_trajectory_state`` and the topics of the quantities that the stage follows, publishes
+    ``voltage_command``, ``voltage_trajectory``, ``tracking_error`` and ``/diagnostics``, provides the services
+    ``~/reset_memory``, ``~/set_zero`` and ``~/arm``.
     Message types, units and QoS are documented in ``msg_schemas/README.md``, parameters in `compensator_parameters`.
     """
 
@@ -116,6 +120,9 @@ class Compensator(LifecycleNode):
         self._state_subscription = self.create_subscription(
             JointState, "stage_state", self._on_state, MEASUREMENTS, raw=True
         )
+        self._surroundings = SurroundingsTopics(self, self._controller, self._on_quantity)
+        self._surroundings_told: dict[str, str] = {}
+        self._surroundings_ns = 0
         self._begun_ns, self._reported_ns = time.monotonic_ns(), 0
         self._model_topic = self.resolve_topic_name("stage_model")
         self._model_reader = ThreadPoolExecutor(1, "stage_model")
@@ -337,6 +344,28 @@ class Compensator(LifecycleNode):
             self.get_logger().error(f"nothing more is published: {controller.ownership.obstacle[1]}")
             if before is OperatingMode.RESETTING:
                 self._answer_reset()
+            self._report()
+
+    def _on_quantity(self, key: str, value: float) -> None:
+        self._controller.surround(key, value, time.monotonic_ns())
+
+    def _watch_surroundings(self, now_ns: int) -> None:
+        """Look for the topics of quantities, and log once what is wrong with one."""
+        if now_ns - self._surroundings_ns < SURROUNDINGS_NS:
+            return
+        self._surroundings_ns = now_ns
+        wanted = [topic for topic in self._settings.values["surroundings"] if topic]
+        self._surroundings.update(wanted)
+        told = {}
+        for key, one in self._controller.surroundings.items():
+            problem = self._surroundings.refused.get(key) or one.problem(now_ns)
+            if problem:
+                told[key] = problem
+                if key not in self._surroundings_told:
+                    self.get_logger().warning(problem)
+        news = told.keys() != self._surroundings_told.keys()
+        self._surroundings_told = self._reporter.surroundings = told
+        if news:
             self._report()
 
     def _on_arm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
@@ -608,6 +637,7 @@ class Compensator(LifecycleNode):
         if not controller.active:
             return
         self._work_off()
+        self._watch_surroundings(now_ns)
         self._locate()
         self._tell_notes()
         self._tell_calibrations()

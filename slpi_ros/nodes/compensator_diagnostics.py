@@ -32,6 +32,7 @@ class Reporter:
         self.models_refused = 0
         self.lost = self.worked_off = self.largest_backlog = 0  # messages: by the middleware, of a backlog
         self.others: list[str] = []  # nodes that also publish the voltages
+        self.surroundings: dict[str, str] = {}  # what is wrong with a quantity that the stage follows
         self.age: float | None = None  # s, of the last answered command by its stamp
         self._controller = controller
         self._diagnostics = Diagnostics(node, "compensator")
@@ -50,6 +51,11 @@ class Reporter:
             for axis in self._controller.axes:
                 values |= _axis_values(axis, model.created)
                 values[f"{axis.name}.start_voltage"] = self._controller.ownership.notes.get(axis.name, "")
+            now_ns = time.monotonic_ns()
+            for key, one in self._controller.surroundings.items():
+                age = one.age_ns(now_ns)
+                values[f"{key}.value"] = f"{one.value:.6g}" if age is not None else ""
+                values[f"{key}.age_s"] = f"{age * 1e-9:.3f}" if age is not None else ""
         problems = tuple((level, text) for wrong, level, text in self._problems(settings) if wrong)
         hardware_id = settings.values["hardware_id"] or (model.hardware_id if model else "")
         self._diagnostics.report(Health(problems, self._summary(), values, hardware_id))
@@ -204,6 +210,8 @@ class Reporter:
                 yield note != "" and obstacle is None and not ownership.started, WARN, f"axis '{name}': {note}"
         others = ", ".join(self.others)
         yield others != "", WARN, f"{others} also publishes voltage_command; stop it, or the voltage jumps between both"
+        for said in self.surroundings.values():
+            yield True, WARN, said
         yield self._controller.too_fast != "", WARN, f"trajectory {self._controller.too_fast}"
         silence = self._silence()
         yield silence != "", WARN, silence

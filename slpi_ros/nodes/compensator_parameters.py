@@ -129,6 +129,11 @@ DECLARATIONS = (
     ),
     each_axis("safe_voltage", 0.0, "Safe voltage, volts.", VOLTAGE),
     scalar("ramp_rate", 50.0, "Rate of the ramp to safe_voltage, V/s, at most 80 % of slew_limit.", POSITIVE_RATE),
+    Declaration(
+        "surroundings", [""],
+        "Topics, topic:field, of the recorded quantities that the stage follows (temperature, load); empty: as the "
+        "model names them. Others than the model's are taken in its order.",
+    ),
     # Memory
     text(
         "start_memory", "end",

@@ -47,6 +47,11 @@ DECLARATIONS = (
         "another stage than the published model; empty: none.",
     ),
     Declaration("topic", "stage_state", "Topic of the bag that holds voltage and displacement."),
+    Declaration(
+        "surroundings", [""],
+        "Recorded quantities that the stage may follow, topic or topic:field: the model compensates those that it "
+        "follows; empty: none, and for ~/diagnose every one that the bag holds.",
+    ),
     Declaration("kind", "slpi", f"Kind of hysteresis model: {', '.join(KINDS)}.", choices=tuple(KINDS)),
     Declaration("output", "", "File for the model document; empty: none."),
     Declaration(
@@ -112,6 +117,7 @@ class IdentifySettings:
             unconditional=values["replace"],
             sensor_delay=checked["sensor_delay"],
             sensor_lag=checked["sensor_lag"],
+            surroundings=tuple(topic for topic in values["surroundings"] if topic),
         )
         folder = values["watch_directory"]
         if folder:
@@ -421,7 +427,9 @@ class Identify(Node):
         if outcome.document:
             self._model = parse_model(outcome.document, "identify")
             self._stage = StageIdentity.of(self._model, request.stage)
-            self._identified = DiagnosisRequest(request.bags, request.topic, outcome.document)
+            self._identified = DiagnosisRequest(
+                request.bags, request.topic, outcome.document, surroundings=request.surroundings
+            )
             self._diagnosis.forget()
             self._write(self._model, request.output)
             self._in_use = outcome.document

@@ -123,6 +123,7 @@ class FitRequest:
     unconditional: bool = False  # published whatever the comparison says
     sensor_delay: float = 0.0  # s, known
     sensor_lag: float = 0.0  # s, known
+    surroundings: tuple[str, ...] = ()  # recorded quantities that the stage may follow
 
     @property
     def source(self) -> str:
@@ -149,7 +150,9 @@ def fit(request: FitRequest) -> FitOutcome:
 
     try:
         sensor = Sensor(request.sensor_delay, request.sensor_lag)
-        source = Source(request.bags, request.topic, start=request.start, stop=request.stop)
+        source = Source(
+            request.bags, request.topic, start=request.start, stop=request.stop, surroundings=request.surroundings
+        )
         records = source.read()
         if request.stage:
             for record in records:
@@ -188,6 +191,7 @@ class DiagnosisRequest:
     topic: str
     document: str
     folder: str = ""
+    surroundings: tuple[str, ...] = ()  # recorded quantities that are looked at; empty: all
 
     @property
     def source(self) -> str:
@@ -214,7 +218,8 @@ def run_diagnosis(request: DiagnosisRequest) -> DiagnosisOutcome:
     try:
         make_folder(folder, *FILES)
         model = parse_model(request.document, "stage_model")
-        diagnosis = diagnose(DiagnoseRequest(Source(request.bags, request.topic), model)).diagnosis
+        source = Source(request.bags, request.topic, surroundings=request.surroundings or None)
+        diagnosis = diagnose(DiagnoseRequest(source, model)).diagnosis
         write_files(folder, diagnosis)
     except SlpiError as error:
         return DiagnosisOutcome(error=str(error))

@@ -1,6 +1,5 @@
 """Node ``recorder``: records topics into a bag without rosbag2."""
 
-import importlib
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -12,7 +11,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.bag_writer import STORAGES, BagWriter
 from slpi_ros.io.messages import JOINT_STATE
-from slpi_ros.nodes.common import request_stop
+from slpi_ros.nodes.common import message_class, request_stop
 from slpi_ros.nodes.parameters import Declaration, Parameters, validated
 
 # Queue length for bursts during slow disk writes.
@@ -109,7 +108,7 @@ class Recorder(Node):
         elif self._bag is not None:
             self._bag.add_topic(name, msgtype)
         self._listening[name] = self.create_subscription(
-            _message_class(name, msgtype), name, partial(self._record, name), qos, raw=True
+            message_class(name, msgtype), name, partial(self._record, name), qos, raw=True
         )
 
     def _stop_in(self, seconds: float) -> Any:
@@ -153,13 +152,3 @@ class Recorder(Node):
         except RecordError as error:
             raise RecordError(f"{error}; its unfinished files are in {bag.partial}") from error
         self.get_logger().info(f"{bag.message_count} messages in {bag.path}")
-
-
-def _message_class(topic: str, msgtype: str) -> Any:
-    package, kind, name = msgtype.split("/")
-    try:
-        return getattr(importlib.import_module(f"{package}.{kind}"), name)
-    except (ImportError, AttributeError) as error:
-        raise RecordError(
-            f"recorder: {topic} is {msgtype}, which is not installed; source its workspace or omit the topic"
-        ) from error

@@ -8,18 +8,20 @@ from collections.abc import Sequence
 from dataclasses import fields
 from functools import partial
 
+import numpy as np
 from builtin_interfaces.msg import Time
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rosgraph_msgs.msg import Clock as ClockMsg
-from sensor_msgs.msg import JointState
-from std_msgs.msg import Float64MultiArray
+from sensor_msgs.msg import JointState, Temperature
+from std_msgs.msg import Float64, Float64MultiArray
 
 from slpi_ros.errors import UsageError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.nodes.common import COMMANDS
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, validated
 from slpi_ros.simulation.character import Character
+from slpi_ros.simulation.room import Room
 from slpi_ros.simulation.stage import Stage, p11_stage
 
 LOG_PERIOD = 5.0
@@ -28,6 +30,8 @@ QUIET = 0.3
 # Seconds; creep has decayed after this time.
 DAY = 86_400.0
 VOLTAGE = (-10_000.0, 10_000.0)
+# Noise of the sensors in the room, kelvin and newton; readings of the load for each of the temperature.
+NOISE_OF_TEMPERATURE, NOISE_OF_LOAD, LOADS = 0.01, 0.01, 10
 GIVEN, DRAWN, HIDDEN = "given", "drawn", "hidden"
 DECLARATIONS = (
     Declaration("axes", ["x"], "Names of the axes, in the order of voltage_command.", read_only=True),
@@ -71,6 +75,19 @@ DECLARATIONS = (
         "given: the effects named below. drawn: one or two effects per axis, drawn from the seed and logged. hidden: "
         "the same, but not told.",
         read_only=True, choices=(GIVEN, DRAWN, HIDDEN),
+    ),
+    Declaration(
+        "room_swing", 0.0,
+        "Rms of the temperature of the room about 21 °C, kelvin; more than 0: it is published, as is the load.",
+        read_only=True, between=(0.0, 50.0), number=True,
+    ),
+    Declaration(
+        "room_load", 2.0, "Largest load of the stage, newton; it comes and goes.",
+        read_only=True, between=(0.0, 1e4), number=True,
+    ),
+    Declaration(
+        "room_rate", 2.0, "Readings of the temperature per second, hertz; of the load ten times as many.",
+        read_only=True, between=(1e-3, 100.0), number=True,
     ),
     *(
         Declaration(
@@ -132,6 +149,31 @@ class StageSimulator(Node):
             f"{self._commands.topic_name}, publishes {self._publisher.topic_name}"
         )
         self._publish()
+        if values["room_swing"]:
+            self._open_room(values, steady)
+
+    def _open_room(self, values: Values, steady: Clock) -> None:
+        """Publish what sensors in the room of the stage read."""
+        self._room, self._readings = _room(values), np.random.default_rng([values["seed"], 3])
+        self._temperature = self.create_publisher(Temperature, "room/temperature", COMMANDS)
+        self._load = self.create_publisher(Float64, "load", COMMANDS)
+        period = 1.0 / (values["room_rate"] * self._speed)
+        self.create_timer(period, self._on_temperature, clock=steady)
+        self.create_timer(period / LOADS, self._on_load, clock=steady)
+
+    def _on_temperature(self) -> None:
+        now_ns = self._now_ns()
+        value = float(self._room.temperature(np.array([now_ns * 1e-9]))[0]) + self._noise(NOISE_OF_TEMPERATURE)
+        message = Temperature(temperature=value, variance=NOISE_OF_TEMPERATURE**2)
+        message.header.stamp = _time(now_ns)
+        self._temperature.publish(message)
+
+    def _on_load(self) -> None:
+        value = float(self._room.load(np.array([self._now_ns() * 1e-9]))[0])
+        self._load.publish(Float64(data=value + self._noise(NOISE_OF_LOAD)))
+
+    def _noise(self, rms: float) -> float:
+        return rms * float(self._readings.standard_normal())
 
     def _now_ns(self) -> int:
         """Return the time of the stage (ns), which never decreases, even if the clock of the node is set back."""
@@ -198,7 +240,7 @@ def _make_stage(values: Values) -> tuple[Stage, str]:
     axes, preset, seed, noise = list(values["axes"]), values["preset"], values["seed"], values["noise_rms"]
     names = [figure.name for figure in fields(Character)]
     given = [Character(**{name: values[name][place] for name in names}) for place in range(len(axes))]
-    own = values["character"] != GIVEN or any(character.effects for character in given)
+    own = values["character"] != GIVEN or any(one.effects or one.has_surroundings for one in given)
     if preset:
         if preset != "p11":
             raise UsageError(f"stage_simulator: no preset '{preset}'; choose p11, or none")
@@ -214,9 +256,13 @@ def _make_stage(values: Values) -> tuple[Stage, str]:
         return Stage.random(axes, seed, noise), ""
     if values["character"] == GIVEN:
         digest = hashlib.sha256(repr(given).encode()).hexdigest()[:8]
-        return Stage.of(axes, given, seed, noise), f"-{digest}"
+        return Stage.of(axes, given, seed, noise, _room(values)), f"-{digest}"
     drawn = Stage.hidden(axes, seed, noise, rate=values["rate"], voltage_max=values["voltage_max"])
     return drawn, f"-{values['character']}"
+
+
+def _room(values: Values) -> Room:
+    return Room(values["seed"], values["room_swing"], values["room_load"])
 
 
 def _limits(stage: Stage, low: float, high: float) -> tuple[float, float]:

@@ -11,6 +11,7 @@ from slpi_ros.simulation.character import PLAIN, Character
 from slpi_ros.simulation.dynamics import Creep, FlexureMode, Relaxation
 from slpi_ros.simulation.parameters import AxisParameters
 from slpi_ros.simulation.preisach import PreisachHysteresis
+from slpi_ros.simulation.room import Room
 from slpi_ros.simulation.surroundings import Hum, Interferometer, Sensor
 
 # Voltage rate (V/s) at which the coercivity has grown by `rate_dependence`; rate below which the growth is linear
@@ -22,7 +23,14 @@ class SimulatedAxis:
     """One axis: hysteresis and noise of its parameters, all else of its character; `seed` is that of the noise."""
 
     # Voltage and displacement are linear between samples; the first sample after `rest` has no duration.
-    def __init__(self, parameters: AxisParameters | None = None, seed: int = 0, character: Character = PLAIN) -> None:
+    # It follows `room`, whose clock is that of the samples; the temperature of the axis counts from the room's mean.
+    def __init__(
+        self,
+        parameters: AxisParameters | None = None,
+        seed: int = 0,
+        character: Character = PLAIN,
+        room: Room | None = None,
+    ) -> None:
         self.parameters, self.character = parameters or AxisParameters(), character
         self._hysteresis = PreisachHysteresis(self.parameters)
         self._lag = Relaxation(np.array([character.lag])) if character.lag else None
@@ -32,6 +40,7 @@ class SimulatedAxis:
         self._interferometer = Interferometer(character.sensor_period, character.sensor_amplitude)
         self._hum = Hum(character.hum_frequency, character.hum_amplitude, float(seed % 7))
         self._noise = Sensor(self.parameters.noise_rms, self.parameters.quantisation, seed)
+        self._room = room if character.has_surroundings else None
         self._commands: deque[tuple[float, float]] = deque()
         self.rest()
 
@@ -71,13 +80,21 @@ class SimulatedAxis:
             y = self._creep.step(dt, y)
         if self._mode:
             y = self._mode.step(dt, y)
-        return y * (1.0 + self.character.gain_drift * self._drifted(t)) if self.character.gain_drift else y
+        if self.character.gain_drift:
+            y *= 1.0 + self.character.gain_drift * self._drifted(t)
+        if self._room:
+            warmer, loaded = self._surrounded(self._room, t)
+            y *= 1.0 + self.character.temperature_gain * warmer + self.character.load_gain * loaded
+        return y
 
     def read(self, t: float, motion: float) -> float:
         """Return the reading (m), without noise, at time `t` (s) for the motion (m) of this axis with coupling."""
         y = self.parameters.offset + motion
         if self.character.thermal_drift:
             y += self.character.thermal_drift * self._drifted(t)
+        if self._room:
+            warmer, loaded = self._surrounded(self._room, t)
+            y += self.character.temperature_offset * warmer + self.character.load_offset * loaded
         if self.character.sensor_amplitude:
             y = float(self._interferometer.read(np.asarray(y)))
         if self.character.hum_amplitude:
@@ -98,6 +115,11 @@ class SimulatedAxis:
             raise UsageError(f"stage: time {t} s after {last} s; times must be finite and non-decreasing")
         self._last = t
         return t - last
+
+    def _surrounded(self, room: Room, t: float) -> tuple[float, float]:
+        """Return by how much (K) the axis is warmer than usual at time `t` (s), and its load (N)."""
+        at = np.array([t])
+        return float(room.temperature(at, self.character.temperature_time)[0]) - room.mean, float(room.load(at)[0])
 
     def _drifted(self, t: float) -> float:
         return -math.expm1(-(t - self._start) / self.character.drift_time)

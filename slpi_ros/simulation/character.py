@@ -35,6 +35,11 @@ class Character:
     coupling: float = _figure(0.0, "Share of the motion of every other axis.", -0.499, 0.499)
     thermal_drift: float = _figure(0.0, "Final value of the drift, metres.", -1e-3, 1e-3)
     gain_drift: float = _figure(0.0, "Final relative change of the sensitivity.", -0.499, 0.499)
+    temperature_offset: float = _figure(0.0, "Displacement for each kelvin of the room, metres.", -1e-3, 1e-3)
+    temperature_gain: float = _figure(0.0, "Relative change of the sensitivity for each kelvin.", -0.1, 0.1)
+    temperature_time: float = _figure(0.0, "Time constant of the stage's own temperature, seconds.", 0.0, 1e6)
+    load_offset: float = _figure(0.0, "Displacement for each newton of the load, metres.", -1e-3, 1e-3)
+    load_gain: float = _figure(0.0, "Relative change of the sensitivity for each newton.", -0.1, 0.1)
     drift_time: float = _figure(120.0, "Time constant of both drifts, seconds.", 1e-3, 1e6)
     sensor_period: float = _figure(316e-9, "Period of the sensor's periodic error, metres.", 1e-9, 1e-3)
     sensor_amplitude: float = _figure(0.0, "Amplitude of the sensor's periodic error, metres.", 0.0, 1e-4)
@@ -59,7 +64,12 @@ class Character:
     @property
     def depends_on_time(self) -> bool:
         """Whether the displacement depends on time in addition to the sequence of voltages."""
-        return not {"saturation", "cross_coupling", "sensor_periodic"}.issuperset(self.effects)
+        return not {"saturation", "cross_coupling", "sensor_periodic"}.issuperset(self.effects) or self.has_surroundings
+
+    @property
+    def has_surroundings(self) -> bool:
+        """Whether the axis follows its room."""
+        return any((self.temperature_offset, self.temperature_gain, self.load_offset, self.load_gain))
 
 
 # The parameter that sets the strength of each effect.

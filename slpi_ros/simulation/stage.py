@@ -11,6 +11,7 @@ from slpi_ros.simulation.axis import SimulatedAxis
 from slpi_ros.simulation.character import PLAIN, STRENGTHS, Character, draw
 from slpi_ros.simulation.dynamics import Creep
 from slpi_ros.simulation.parameters import AxisParameters
+from slpi_ros.simulation.room import Room
 
 # Seeds of the axes of one stage differ by this number.
 NEXT_AXIS = 1000
@@ -30,8 +31,15 @@ class Stage:
         return cls.of(names, [PLAIN] * len(names), seed, noise_rms)
 
     @classmethod
-    def of(cls, names: Sequence[str], characters: Sequence[Character], seed: int, noise_rms: float | None) -> "Stage":
-        """Return a stage at rest with the hysteresis of `random`, and one character for each axis."""
+    def of(
+        cls,
+        names: Sequence[str],
+        characters: Sequence[Character],
+        seed: int,
+        noise_rms: float | None,
+        room: Room | None = None,
+    ) -> "Stage":
+        """Return a stage at rest with the hysteresis of `random`, and one character for each axis, in a room."""
         if len(set(names)) != len(names):
             raise UsageError(f"stage: axes {', '.join(names)} are not unique; give each axis its own name")
         axes = {}
@@ -39,7 +47,7 @@ class Stage:
             parameters = AxisParameters.random(own)
             if noise_rms is not None:
                 parameters = replace(parameters, noise_rms=noise_rms)
-            axes[name] = SimulatedAxis(parameters, own, character)
+            axes[name] = SimulatedAxis(parameters, own, character, room)
         return cls(axes)
 
     @classmethod

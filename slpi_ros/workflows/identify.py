@@ -1,8 +1,9 @@
 """Identification of a model from records: read, check, fit."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
+from slpi_ros.diagnosis.diagnose import following
 from slpi_ros.identification import fit
 from slpi_ros.identification.cross_validation import CrossValidationReport, cross_validate
 from slpi_ros.identification.uncertainty import CurveUncertainty, curve_uncertainty, require_known_uncertainty
@@ -36,6 +37,7 @@ class IdentifyOutcome:
     model: StageModel
     records: Sequence[Record]
     findings: Sequence[Findings]
+    unmoved: Sequence[str] = ()  # named quantities that the stage does not follow, with the axis
 
     def held_out(self) -> dict[str, CrossValidationReport]:
         """Return the held-out errors of each axis, by cross-validation."""
@@ -69,7 +71,7 @@ def identify(request: IdentifyRequest) -> IdentifyOutcome:
     """Identify a model."""
     request.require_possible()
     source, sensor = request.source, request.sensor
-    records = source.read()
+    records = replace(source, surroundings=source.surroundings or ()).read()
     found = require_records(records, source, {axis: sensor for record in records for axis in record.axes})
     model = fit.identify(
         records,
@@ -81,4 +83,7 @@ def identify(request: IdentifyRequest) -> IdentifyOutcome:
         sensor_delay=sensor.delay,
         sensor_lag=sensor.lag,
     )
-    return IdentifyOutcome(request, model, records, found)
+    unmoved: Sequence[str] = ()
+    if source.surroundings:
+        model, unmoved = following(records, model, start=source.start, stop=source.stop)
+    return IdentifyOutcome(request, model, records, found, unmoved)

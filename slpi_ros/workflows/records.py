@@ -2,13 +2,14 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from slpi_ros.errors import IdentificationError, ModelError, RecordError, SlpiError, UsageError
 from slpi_ros.identification.record_quality import Finding, assess, findings, require_usable
 from slpi_ros.io.alignment import SeparateTopics
 from slpi_ros.io.bag_reader import read_bag, require_different, require_one_stage
 from slpi_ros.io.record import Record
+from slpi_ros.io.surroundings import named_in
 from slpi_ros.model.sensor import IDEAL, Sensor, corrected
 from slpi_ros.model.stage_model import StageModel
 
@@ -35,11 +36,12 @@ class Source:
     stop: float | None = None  # s
     records: Sequence[Record] = ()
     assessed: bool = False  # `assess_record` has found the axes in use usable already
+    surroundings: Sequence[str] | None = None  # recorded quantities, TOPIC[:FIELD]; default: all that can be one
 
     def read(self, *, coupled: bool = False) -> tuple[Record, ...]:
         """Return the records; with `coupled`, also axes that are not in use, which may couple into the others."""
         if self.records:
-            return tuple(self.records)
+            return tuple(_with_chosen(record, self.surroundings) for record in self.records)
         records = tuple(self._read(str(bag), coupled) for bag in require_different(self.bags))
         require_one_stage(records)
         return records
@@ -47,13 +49,28 @@ class Source:
     def _read(self, bag: str, coupled: bool) -> Record:
         # Separate topics may not name their axes; their names are then those of the request.
         if not coupled or (self.axes and isinstance(self.topic, SeparateTopics)):
-            return read_bag(bag, self.topic, axes=self.axes)
+            return read_bag(bag, self.topic, axes=self.axes, surroundings=self.surroundings)
         try:
-            return read_bag(bag, self.topic)
+            return read_bag(bag, self.topic, surroundings=self.surroundings)
         except RecordError:
             if not self.axes:
                 raise
-            return read_bag(bag, self.topic, axes=self.axes)
+            return read_bag(bag, self.topic, axes=self.axes, surroundings=self.surroundings)
+
+    def for_model(self, model: StageModel) -> "Source":
+        """Return the source with the quantities that a model follows, if any, unless others are named."""
+        return self if self.surroundings is not None or model.quantities else replace(self, surroundings=())
+
+
+def _with_chosen(record: Record, chosen: Sequence[str] | None) -> Record:
+    """Return a record with the chosen quantities only; RecordError if it lacks one."""
+    if chosen is None or not (chosen or record.surroundings):
+        return record
+    for text in chosen:
+        if not named_in(record.surroundings, [text]):
+            held = ", ".join(record.surroundings) or "none"
+            raise RecordError(f"{record.source}: no quantity '{text}'; it holds {held}; name one of them (--with)")
+    return replace(record, surroundings=named_in(record.surroundings, chosen))
 
 
 @dataclass(frozen=True)

@@ -37,7 +37,9 @@ class RefitOutcome:
 
 def refit(request: RefitRequest) -> RefitOutcome:
     """Correct a model; each record corrects the model that the earlier ones have given."""
-    source, model, steps = request.source, request.model, []
+    model = request.model
+    steps: list[RefitStep] = []
+    source = request.source.for_model(model)
     records = sorted(source.read(coupled=True), key=lambda record: int(record.time_ns[0]))
     for record in records:
         require_for_model([record], model, replace(source, axes=shared_axes([record], model, source)))

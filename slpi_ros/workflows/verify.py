@@ -35,7 +35,8 @@ class VerifyOutcome:
 
 def verify(request: VerifyRequest) -> VerifyOutcome:
     """Verify a model."""
-    source, model = request.source, request.model
+    model = request.model
+    source = request.source.for_model(model)
     records = source.read(coupled=True)
     desired = None
     if not source.records:

@@ -22,6 +22,7 @@ from slpi_ros.effects.self_heating import SelfHeating
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.effects.slew import Slew
 from slpi_ros.effects.steps import Steps
+from slpi_ros.effects.surroundings import Quantity, Surroundings
 from slpi_ros.effects.thermal_drift import ThermalDrift
 
 FloatArray = NDArray[np.float64]
@@ -99,6 +100,30 @@ def resonances(draw: st.DrawFn) -> Resonance:
     return Resonance(tuple(Mode(draw(powers(20, 2000)), draw(powers(1e-3, 0.5)), gain) for gain in gains))
 
 
+@st.composite
+def surroundings(draw: st.DrawFn) -> Surroundings:
+    """Draw up to two quantities of those of a record, so weak that the sensitivity stays well above 0."""
+    topics = draw(
+        st.lists(st.sampled_from(("/room/temperature", "/load", "/unknown")), min_size=1, max_size=2, unique=True)
+    )
+    return Surroundings(
+        tuple(
+            Quantity(
+                topic,
+                draw(st.sampled_from(("", "force.z"))) if topic == "/load" else "",
+                reference=draw(numbers(-1, 1)),
+                offset_gain=draw(st.just(0.0) | numbers(-1e-6, 1e-6)),
+                sensitivity_gain=draw(st.just(0.0) | numbers(-0.05, 0.05)),
+                time_constant=draw(st.just(0.0) | powers(1e-2, 1e3)),
+                lowest=-1.0,
+                highest=1.0,
+            )
+            for topic in topics
+        ),
+        draw(numbers(-1e-5, 1e-5)),
+    )
+
+
 LINES = st.builds(Line, powers(1, 1000), powers(1e-10, 1e-7), numbers(-7, 7))
 
 BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
@@ -111,6 +136,7 @@ BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
     "contact": st.builds(Contact, numbers(-5e-6, 2e-5), powers(0.05, 5)),
     "resonance": resonances(),
     "self_heating": self_heatings(),
+    "surroundings": surroundings(),
     "gain_drift": gain_drifts(),
     "cross_coupling": st.builds(CrossCoupling, st.dictionaries(st.sampled_from("yz"), numbers(-0.4, 0.4), min_size=1)),
     "thermal_drift": drifts(),
@@ -144,7 +170,8 @@ def records(draw: st.DrawFn, acts_on: str) -> Record:
     u = 50 + 40 * _motion(t, rng)
     others = {"y": 1e-5 * _motion(t, rng)} if draw(st.booleans()) else {}
     signal = 2e-7 * u + 1e-9 * u**1.5 + 1e-6 * _motion(t, rng) if acts_on == "displacement" else u
-    return Record(signal, EffectContext(t, others, voltage=u))
+    beside = {"/room/temperature": _motion(t, rng), "/load": _motion(t, rng), "/load:force.z": _motion(t, rng)}
+    return Record(signal, EffectContext(t, others, voltage=u, surroundings=beside))
 
 
 def _motion(t: FloatArray, rng: np.random.Generator) -> FloatArray:

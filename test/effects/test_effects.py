@@ -24,7 +24,7 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.io.schemas import load_schema
 
 EXACT = ("rate_dependence", "creep", "contact", "gain_drift", "cross_coupling", "thermal_drift", "steps")
-EXACT = (*EXACT, "self_heating", "sensor_periodic", "hum")
+EXACT = (*EXACT, "self_heating", "surroundings", "sensor_periodic", "hum")
 INVERTED = ("lag", "creep", "contact", "resonance", "sensor_periodic")
 FOLLOWED = (*INVERTED, "slew")
 

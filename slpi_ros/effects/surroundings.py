@@ -1,0 +1,399 @@
+"""Surroundings: the stage follows quantities that were recorded beside it, such as temperature, load or humidity."""
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+from math import exp, isfinite
+from typing import Any, ClassVar
+
+import numpy as np
+
+from slpi_ros.arrays import FloatArray, Mask
+from slpi_ros.effects.base import (
+    Candidate,
+    EffectBase,
+    EffectContext,
+    FitContext,
+    Followed,
+    ResidualContext,
+    Side,
+    Signal,
+    StreamingBase,
+    longest,
+)
+from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining, safe_duration
+from slpi_ros.effects.filters import filtered, hold
+from slpi_ros.effects.parameters import Fit, Leaf, parameter, require, text
+from slpi_ros.errors import length
+
+# Largest number of quantities.
+MOST = 4
+# Number of time constants of the candidates; the shortest (s), and the longest as a share of the longest record.
+TIME_CONSTANTS, SHORTEST, LONGEST = 6, 1.0, 0.5
+# Largest plausible change of the sensitivity.
+LARGEST = 0.3
+# Time constants, as shares of a record, of the drifts beside which a quantity has to prove itself.
+SETTLES_WITHIN = (0.03, 0.1, 0.3)
+
+
+def _draw(path: DrivePath, limits: DriveLimits) -> None:
+    shortest = 2 * max(limits.quickest(1.0), safe_duration(1.0))
+    repeats = min(max(int(remaining(limits) / shortest), 3), 60)
+    loops(path, 0.0, 1.0, remaining(limits) / (2 * repeats), repeats)
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """A quantity that the stage follows, and how; its gains are for one unit of the quantity."""
+
+    topic: str = text("topic on which it is measured")
+    field: str = text("field of the messages, where they have several", default="")
+    reference: float = parameter("", "value at which it changes nothing, in its unit", -1e30, 1e30, default=0.0)
+    offset_gain: float = parameter(
+        "m", "displacement for one unit", -1e6, 1e6, default=0.0, fit=Fit("linear", absent=True)
+    )
+    sensitivity_gain: float = parameter(
+        "", "relative change of the sensitivity for one unit", -1e6, 1e6, default=0.0, fit=Fit("linear", absent=True)
+    )
+    time_constant: float = parameter(
+        "s", "time constant with which the stage follows, 0: at once", 0, 1e7, default=0.0,
+        fit=Fit("relative", least=0.1 * SHORTEST, within_record=True, absent=True),
+    )  # fmt: skip
+    averaging: float = parameter(
+        "s", "time constant of the mean of the readings that is taken in use, 0: none", 0, 1e7, default=0.0
+    )
+    # Range of the recorded values.
+    lowest: float = parameter("", "lowest recorded value, in its unit", -1e30, 1e30, default=0.0)
+    highest: float = parameter("", "highest recorded value, in its unit", -1e30, 1e30, default=0.0)
+
+    @property
+    def key(self) -> str:
+        """Name of the quantity in a record."""
+        return f"{self.topic}:{self.field}" if self.field else self.topic
+
+    def followed(self, around: EffectContext) -> FloatArray:
+        """Return by how much (its unit) the stage follows, shape (N,); 0 if the quantity is not known."""
+        value = around.surroundings.get(self.key)
+        if value is None:
+            return np.zeros_like(around.t)
+        return _lagged(value - self.reference, self.time_constant, around)
+
+
+@dataclass(frozen=True)
+class Surroundings(EffectBase):
+    """Zero and sensitivity that follow quantities, ``y = x0 + (1 + sum_k s_k w_k) (x - x0) + sum_k o_k w_k``.
+
+    ``w_k`` is the deviation of a quantity from its reference, or that after a first-order lag; ``o_k`` and ``s_k`` are
+    `offset_gain` and `sensitivity_gain`, and ``x0`` is `origin`.
+    """
+
+    name: ClassVar[str] = "surroundings"
+    acts_on: ClassVar[Signal] = "displacement"
+    side: ClassVar[Side] = "stage"
+    what: ClassVar[str] = "zero or sensitivity follow a recorded quantity (temperature, load, humidity, pressure)"
+    compensated: ClassVar[str] = "yes, if the quantity is measured in use"
+    changes_gain: ClassVar[bool] = True
+    follows_quantities: ClassVar[bool] = True
+    proved_beside: ClassVar[tuple[str, ...]] = ("thermal_drift", "gain_drift")
+    excitation: ClassVar[Excitation] = Excitation(
+        "Full loops one after the other while one quantity alone is changed on purpose, up and down several times and "
+        "each time for another while (heat on and off, load on and off): what comes and goes with it is its doing, "
+        "and no drift does that.",
+        _draw,
+        separates=("thermal_drift", "gain_drift", "surroundings"),
+        order=3,
+    )
+
+    quantities: tuple[Quantity, ...] = parameter("", "quantities", count=(1, MOST))
+    origin: float = parameter("m", "displacement that does not change with the sensitivity", -1e3, 1e3, default=0.0)
+    # Of the records of the fit; elsewhere the stage has followed before the start.
+    initial: tuple[float, ...] = parameter(
+        "m", "what is left of before the start of each record, quantity by quantity with a time constant", -1e3, 1e3,
+        default=(), count=(0, 4000),
+    )  # fmt: skip
+    uncertainty: Mapping[str, float] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        keys = [one.key for one in self.quantities]
+        ranges = all(one.lowest <= one.highest for one in self.quantities)
+        require(
+            self,
+            ("quantities", len(set(keys)) == len(keys), "different ones"),
+            ("quantities", ranges, "with a lowest value up to the highest"),
+            ("quantities", all(0 < len(key) <= 400 and key.isprintable() for key in keys), "with printable topics"),
+        )
+
+    @property
+    def followed(self) -> tuple[Followed, ...]:
+        """The quantities with what is known of their range."""
+        return tuple(Followed(one.key, one.reference, one.lowest, one.highest) for one in self.quantities)
+
+    def joined(self, other: "Surroundings") -> "Surroundings | None":
+        """Return the quantities of both; of one that both have that of this effect."""
+        new = [one for one in other.quantities if one.key not in self.keys]
+        quantities = (*self.quantities, *new)
+        return replace(self, quantities=quantities, uncertainty={}) if len(quantities) <= MOST else None
+
+    def only(self, keys: Sequence[str]) -> "Surroundings | None":
+        """Return the effect with some of its quantities; None without any."""
+        kept = tuple(one for one in self.quantities if one.key in keys)
+        return replace(self, quantities=kept, initial=(), uncertainty={}) if kept else None
+
+    def plausible(self, context: FitContext) -> bool:
+        """Return whether the sensitivity changes by little."""
+        changes = sum(abs(one.sensitivity_gain) * (one.highest - one.lowest) for one in self.quantities)
+        return bool(changes <= LARGEST)
+
+    def free_leaves(self) -> list[Leaf]:
+        """Return the fitted numbers; what is 0 is not there."""
+        return [leaf for leaf in super().free_leaves() if not leaf.place.startswith("initial")]
+
+    def parts(self, around: EffectContext) -> tuple[FloatArray, FloatArray]:
+        """Return the factor of the sensitivity, and the displacement (m), shape (N,) each."""
+        factor, offset = np.ones_like(around.t), np.zeros_like(around.t)
+        for one in self.quantities:
+            if one.sensitivity_gain or one.offset_gain:
+                follows = one.followed(around)
+                factor += one.sensitivity_gain * follows
+                offset += one.offset_gain * follows
+        return factor, offset + self._left(around)
+
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
+        """Return the displacement in its surroundings, shape (N,), metres."""
+        factor, offset = self.parts(around)
+        return self.origin + factor * (signal - self.origin) + offset
+
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
+        """Return the displacement at the reference values, shape (N,), metres."""
+        factor, offset = self.parts(around)
+        return self.origin + (signal - offset - self.origin) / factor
+
+    @property
+    def lasting(self) -> "Surroundings":
+        """The effect without the starts of its records."""
+        return replace(self, initial=())
+
+    @property
+    def anew(self) -> "Surroundings":
+        """The effect without the starts of its records."""
+        return self.lasting
+
+    def of_record(self, k: int) -> "Surroundings":
+        """Return the effect with the start of the record of number `k` of those that it was fitted to."""
+        count = len(self._lags)
+        return replace(self, initial=self.initial[k * count : (k + 1) * count])
+
+    def starting(self, around: EffectContext, used: Mask, *, older: bool = False) -> FloatArray:
+        """Return what is left of before each record for each quantity with a time constant, shape (N, k)."""
+        return np.column_stack([np.empty((around.t.size, 0)), *_settling(self._lags, around).values()])
+
+    def started(self, amplitudes: FloatArray, records: int) -> "Surroundings":
+        """Return the effect with what is left of before its records."""
+        return replace(self, initial=tuple(amplitudes.tolist()))
+
+    def averaged(self, seconds: Mapping[str, float]) -> "Surroundings":
+        """Return the effect with the time constants (s), by quantity, of the means that are taken in use."""
+        return replace(
+            self, quantities=tuple(replace(one, averaging=seconds.get(one.key, 0.0)) for one in self.quantities)
+        )
+
+    @property
+    def _lags(self) -> tuple[float, ...]:
+        return tuple(one.time_constant for one in self.quantities if one.time_constant)
+
+    def _left(self, around: EffectContext) -> FloatArray:
+        if not self.initial:
+            return np.zeros_like(around.t)
+        columns = list(_settling(self._lags, around).values())
+        pairs = zip(self.initial, columns, strict=False)
+        return sum((amplitude * column for amplitude, column in pairs), np.zeros_like(around.t))
+
+    @classmethod
+    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+        """Yield for each quantity offset, sensitivity and both, at once and with time constants."""
+        around, low = context.around, float(context.h.min())
+        slowest = LONGEST * longest(around)
+        lags = np.geomspace(SHORTEST, slowest, TIME_CONSTANTS).tolist() if slowest > SHORTEST else []
+        for group, (key, value) in enumerate(around.surroundings.items()):
+            inside = value[context.used]
+            lowest, highest = float(inside.min()), float(inside.max())
+            if not highest > lowest:
+                continue
+            topic, _, own = key.partition(":")
+            found = Quantity(topic, own, float(inside.mean()), lowest=lowest, highest=highest)
+            for tau in (0.0, *lags):
+                one = replace(found, time_constant=tau)
+                follows = one.followed(around)
+                size = float(np.abs(follows).max())
+                if not size > 0.0:
+                    continue
+                starting = [*_settling((tau,), around).values()] if tau else []
+                moved = follows / size
+                for with_offset, with_sensitivity in ((True, False), (False, True), (True, True)):
+                    own_columns = [moved] * with_offset + [moved * (context.h - low)] * with_sensitivity
+                    yield Candidate(
+                        np.column_stack([*starting, *own_columns]),
+                        partial(cls._through, one, size, low, with_offset, len(own_columns)),
+                        starting=len(starting),
+                        group=group,
+                    )
+
+    @classmethod
+    def _through(
+        cls, one: Quantity, size: float, low: float, with_offset: bool, count: int, found: FloatArray
+    ) -> "Surroundings | None":
+        gains = (found[-count:] / size).tolist()
+        if not all(map(isfinite, gains)) or not all(gains):
+            return None
+        offset = gains[0] if with_offset else 0.0
+        sensitivity = gains[-1] if count == 2 or not with_offset else 0.0
+        return cls((replace(one, offset_gain=offset, sensitivity_gain=sensitivity),), low)
+
+    def confounders(self, context: ResidualContext) -> FloatArray:
+        """Return the drifts (m, (N, k)) that each record may have, beside which a quantity has to prove itself."""
+        # Anything that settles or runs away: a straight line, its square, and relaxations from the start of the record.
+        # A quantity that only does that itself is no cause, however well it fits.
+        around = context.around
+        rows, times = np.arange(around.t.size), around.split(around.t)
+        moved = (context.h - float(context.h.min()))[:, None]
+        columns = []
+        turns = any(one.sensitivity_gain for one in self.quantities)
+        for k, (own, t) in enumerate(zip(around.split(rows), times, strict=True)):
+            since = (t - t[0]) / max(float(t[-1] - t[0]), 1e-300)
+            smooth = np.column_stack([since, since**2, *(np.exp(-since / share) for share in SETTLES_WITHIN)])
+            whole = np.zeros((around.t.size, smooth.shape[1]))
+            whole[own] = smooth * float(np.ptp(context.h))
+            columns.append(whole)
+            if turns:
+                whole = np.zeros((around.t.size, smooth.shape[1] + (k > 0)))
+                whole[own] = (np.column_stack([smooth, np.ones(t.size)]) if k else smooth) * moved[own]
+                columns.append(whole)
+        return np.column_stack(columns)
+
+    def describe(self) -> str:
+        """Describe for each quantity what one unit does, and the time constant."""
+        return "; ".join(map(_described, self.quantities))
+
+    def laws(self) -> Mapping[str, Any]:
+        """Return nothing: it does nothing at the reference values, and others are undone beforehand."""
+        return {}
+
+    def streaming(self) -> "StreamingSurroundings":
+        """Return the streaming effect, at first at the reference values."""
+        return StreamingSurroundings(self)
+
+
+class StreamingSurroundings(StreamingBase):
+    """Streaming (sample by sample) surroundings: each quantity holds its last value, at first the reference.
+
+    Of noisy readings it is their running mean.
+    """
+
+    def __init__(self, effect: Surroundings) -> None:
+        self._quantities, self._origin = effect.quantities, effect.origin
+        self._places = {one.key: place for place, one in enumerate(effect.quantities)}
+        self._values: list[float | None] = [None] * len(effect.quantities)
+        # Mean and state of the lag of each quantity, by deviation from the reference.
+        self._states = [(0.0, 0.0)] * len(effect.quantities)
+
+    def surround(self, key: str, value: float) -> None:
+        """Note the value of a quantity for the next sample; one that it does not follow, or not finite, is ignored."""
+        place = self._places.get(key)
+        if place is None or not isfinite(value):
+            return
+        if self._values[place] is None:
+            # The first value that is known: the stage has followed it before.
+            moved = value - self._quantities[place].reference
+            self._states[place] = moved, moved
+        self._values[place] = value
+
+    def forward(self, dt: float, x: float) -> float:
+        """Advance by `dt` (s) to the displacement `x` (m) and return it in its surroundings (m)."""
+        self._states = self._after(dt)
+        factor, offset = self._parts(self._states)
+        return self._origin + factor * (x - self._origin) + offset
+
+    def inverse(self, dt: float, wanted: float) -> float:
+        """Return the displacement (m) at the reference values."""
+        factor, offset = self._parts(self._after(dt))
+        return self._origin + (wanted - offset - self._origin) / factor
+
+    def resume(self, other: "StreamingSurroundings", x: float) -> None:
+        """Take over the values of the quantities from another model's surroundings."""
+        for key, place in other._places.items():
+            value = other._values[place]
+            if value is not None:
+                self.surround(key, value)
+
+    def snapshot(self) -> tuple[tuple[tuple[float, ...], ...], ...]:
+        """Return known value, input and state of each quantity, without the first one where it is not known."""
+        pairs = zip(self._values, self._states, strict=True)
+        return (tuple((*state,) if value is None else (value, *state) for value, state in pairs),)
+
+    def restore(self, state: Any) -> None:
+        """Replace the state by one returned by `snapshot`."""
+        for place, one in enumerate(state[0]):
+            self._values[place] = one[0] if len(one) == 3 else None
+            self._states[place] = one[-2], one[-1]
+
+    def _after(self, dt: float) -> list[tuple[float, float]]:
+        states = []
+        for one, value, (before, state) in zip(self._quantities, self._values, self._states, strict=True):
+            moved = before if value is None else value - one.reference
+            if one.averaging:
+                moved -= exp(-dt / one.averaging) * (moved - before)
+            if one.time_constant:
+                step = hold(dt, one.time_constant)
+                state = step.now * moved + step.before * before + step.kept * state
+            else:
+                state = moved
+            states.append((moved, state))
+        return states
+
+    def _parts(self, states: Sequence[tuple[float, float]]) -> tuple[float, float]:
+        factor, offset = 1.0, 0.0
+        for one, (_, follows) in zip(self._quantities, states, strict=True):
+            factor += one.sensitivity_gain * follows
+            offset += one.offset_gain * follows
+        return factor, offset
+
+
+def _lagged(value: FloatArray, time_constant: float, around: EffectContext) -> FloatArray:
+    """Return a quantity after a first-order lag, shape (N,), from equilibrium at the start of each record."""
+    if not time_constant:
+        return value
+    parts = []
+    for own, record in zip(around.split(value), around.records or (around,), strict=True):
+        grid = record.uniform
+        if not (own.size and grid.dt > 0.0):
+            parts.append(own)
+            continue
+        now, before, kept = hold(grid.dt, time_constant)
+        moved = grid.on(own - own[0])
+        parts.append(own[0] + grid.off(filtered([now, before], [1.0, -kept], moved)))
+    return np.concatenate(parts)
+
+
+def _settling(time_constants: Sequence[float], around: EffectContext) -> dict[tuple[int, int], FloatArray]:
+    """Return what is left of 1 m at the start of each record for each time constant, shape (N,) each, by both."""
+    columns = {}
+    for k, (rows, t) in enumerate(zip(around.split(np.arange(around.t.size)), around.split(around.t), strict=True)):
+        for place, tau in enumerate(time_constants):
+            whole = np.zeros(around.t.size)
+            whole[rows] = np.exp(-(t - t[:1]) / tau)
+            columns[k, place] = whole
+    return columns
+
+
+def _described(one: Quantity) -> str:
+    said = []
+    if one.offset_gain:
+        said.append(f"the zero moves by {length(one.offset_gain)}")
+    if one.sensitivity_gain:
+        said.append(f"the sensitivity by {100 * one.sensitivity_gain:.3g} %")
+    late = f", with a time constant of {one.time_constant:.3g} s" if one.time_constant else ""
+    return (
+        f"for each unit of {one.key} {' and '.join(said) or 'nothing changes'}{late} (recorded from {one.lowest:.4g} "
+        f"to {one.highest:.4g})"
+    )

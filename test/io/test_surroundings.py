@@ -1,0 +1,125 @@
+"""Quantities beside a stage in bags that rosbags wrote: types, stamps, clocks, gaps, and what is no quantity."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from bag_makers import STORE, float64, header, joint_state, rosbags_bag
+from refusals import holds, refusal
+
+from slpi_ros.errors import RecordError
+from slpi_ros.io.bag_reader import read_bag
+from slpi_ros.io.surroundings import clean, named_in
+
+SECOND = 10**9
+START = 1_700_000_000 * SECOND
+STATE = [
+    (START + k * SECOND // 100, joint_state(START + k * SECOND // 100, ("x",), (k,), (2 * k,))) for k in range(500)
+]
+
+
+def measured(msgtype, field, stamp_ns, value):
+    return STORE.types[f"sensor_msgs/msg/{msgtype}"](header=header(stamp_ns), variance=0.0, **{field: float(value)})
+
+
+def temperature(stamp_ns, value):
+    return measured("Temperature", "temperature", stamp_ns, value)
+
+
+def wrench(stamp_ns, z):
+    vector = STORE.types["geometry_msgs/msg/Vector3"]
+    inside = STORE.types["geometry_msgs/msg/Wrench"](
+        force=vector(x=0.0, y=1.0, z=float(z)), torque=vector(x=2.0, y=3.0, z=4.0)
+    )
+    return STORE.types["geometry_msgs/msg/WrenchStamped"](header=header(stamp_ns), wrench=inside)
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_every_type_is_read_and_aligned_by_its_stamps(tmp_path, storage):
+    # Irregular, slower, late on the wire, partly without a value.
+    at = np.array([0.02, 0.7, 1.9, 4.4])
+    value = np.array([20.0, 20.5, np.nan, 21.0])
+    stamps = (START + at * SECOND).astype(np.int64).tolist()
+
+    def series(make, late=SECOND // 2):
+        return [(stamp + late, make(stamp, one)) for stamp, one in zip(stamps, value.tolist(), strict=True)]
+
+    beside = {
+        "/room/temperature": series(temperature),
+        "/room/humidity": series(lambda stamp, one: measured("RelativeHumidity", "relative_humidity", stamp, one)),
+        "/room/pressure": series(lambda stamp, one: measured("FluidPressure", "fluid_pressure", stamp, one)),
+        "/load": series(wrench),
+        "/plain": series(lambda stamp, one: float64(one), late=0),
+        "/other/stage_state": series(lambda stamp, one: joint_state(stamp, ("a", "b"), (one, 1.0), (2.0, 3.0))),
+    }
+    record = read_bag(rosbags_bag(tmp_path / "bag", {"/stage_state": STATE, **beside}, storage))
+    several = {f"/load:{part}.{axis}" for part in ("force", "torque") for axis in "xyz"}
+    several |= {f"/other/stage_state:{field}.{axis}" for field in ("position", "effort") for axis in "ab"}
+    assert set(record.surroundings) == {"/room/temperature", "/room/humidity", "/room/pressure", "/plain", *several}
+    for name in ("/room/temperature", "/load:force.z", "/plain", "/other/stage_state:position.a"):
+        t, read = record.surroundings[name]
+        np.testing.assert_allclose(t, at, atol=1e-6)
+        np.testing.assert_array_equal(read, value)
+    t, read = clean(record.surroundings["/plain"])
+    np.testing.assert_allclose(t, at[[0, 1, 3]], atol=1e-6)
+    np.testing.assert_array_equal(read, value[[0, 1, 3]])
+    # A part of the record keeps its own zero of time.
+    t, _ = record.part(slice(100, None)).surroundings["/plain"]
+    np.testing.assert_allclose(t, at - 1.0, atol=1e-6)
+
+
+def test_messages_without_stamps_are_on_the_clock_of_the_stage(tmp_path):
+    """Where the stage's stamps are those of a simulation, or late on the wire, the times of recording are shifted."""
+    late = 7 * SECOND
+    state = [(stamp + late, message) for stamp, message in STATE]
+    load = [(START + late + k * SECOND, float64(k)) for k in range(5)]
+    record = read_bag(rosbags_bag(tmp_path / "bag", {"/stage_state": state, "/load": load}))
+    np.testing.assert_allclose(record.surroundings["/load"][0], np.arange(5.0), atol=1e-6)
+
+
+def test_topics_of_the_stage_itself_are_no_surroundings(tmp_path):
+    own = {f"/{name}": STATE for name in ("measured_displacement", "tracking_error", "desired_displacement")}
+    own["/voltage"] = STATE
+    record = read_bag(rosbags_bag(tmp_path / "bag", {"/stage_state": STATE, **own}))
+    assert record.surroundings == {}
+
+
+def test_named_quantities(tmp_path):
+    beside = {"/room/temperature": [(START, temperature(START, 20.0))], "/load": [(START, wrench(START, 5.0))]}
+    bag = rosbags_bag(tmp_path / "bag", {"/stage_state": STATE, **beside})
+    assert set(read_bag(bag, surroundings=["temperature"]).surroundings) == {"/room/temperature"}
+    assert set(read_bag(bag, surroundings=["load:force.z"]).surroundings) == {"/load:force.z"}
+    assert read_bag(bag, surroundings=[]).surroundings == {}
+    assert holds(refusal(RecordError, read_bag, bag, surroundings=["humidity"]), "humidity", "temperature")
+    assert holds(refusal(RecordError, read_bag, bag, surroundings=["load:mass"]), "mass", "force.z")
+    assert holds(
+        refusal(RecordError, read_bag, bag, surroundings=["stage_state:velocity.x"]), "velocity.x", "position.x"
+    )
+    record = read_bag(bag)
+    assert set(named_in(record.surroundings, ["load:force.z", "/room/temperature"])) == {
+        "/load:force.z",
+        "/room/temperature",
+    }
+    assert named_in(record.surroundings, ["temperature:force"]) == {
+        "/room/temperature": record.surroundings["/room/temperature"]
+    }
+
+
+def test_what_cannot_be_read_is_said_unless_it_was_asked_for(tmp_path):
+    from slpi_ros.io.bag_writer import BagWriter
+
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.add_topic("/temperature", "sensor_msgs/msg/Temperature")
+        for stamp, message in STATE:
+            bag.write(stamp, bytes(STORE.serialize_cdr(message, message.__msgtype__)))
+        bag.write(START, b"\0\1\0\0short", "/temperature")
+    record = read_bag(tmp_path / "bag")
+    assert record.surroundings == {}
+    assert any("/temperature" in note for note in record.notes)
+    refusal(RecordError, read_bag, tmp_path / "bag", surroundings=["temperature"])
+
+
+def test_courses_have_one_value_for_each_time(tmp_path):
+    record = read_bag(rosbags_bag(tmp_path / "bag", {"/stage_state": STATE}))
+    with pytest.raises(RecordError):
+        replace(record, surroundings={"/t": (np.zeros(2), np.zeros(3))})

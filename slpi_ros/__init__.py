@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from slpi_ros.identification.refit import refit
     from slpi_ros.io.bag_reader import read_bag
     from slpi_ros.io.record import Record
+    from slpi_ros.learning.learner import Learner
     from slpi_ros.model.axis_model import AxisModel
     from slpi_ros.model.document import load_model, save_model
     from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
 _MODULES = {
     "AxisModel": "model.axis_model",
     "HeldAtLimitWarning": "model.stage_model",
+    "Learner": "learning.learner",
     "Record": "io.record",
     "SlpiError": "errors",
     "StageModel": "model.stage_model",
@@ -42,6 +44,7 @@ _MODULES = {
 __all__ = [
     "AxisModel",
     "HeldAtLimitWarning",
+    "Learner",
     "Record",
     "SlpiError",
     "StageModel",

@@ -34,6 +34,10 @@ def compiled(function: Callable[..., FloatArray]) -> Callable[..., FloatArray]:
     return njit(nogil=True)(function) if njit else function
 
 
+# Continues a stage: displacement (m, (N,)) for durations since the preceding sample (s, (N,)) and voltages (V, (N,)).
+Continued = Callable[[FloatArray, FloatArray], FloatArray]
+
+
 class Stage(Protocol):
     """A stage at rest before the first sample, at the low end of its range."""
 
@@ -97,16 +101,24 @@ class ThermalRelays:
         ndarray, shape (N,), metres
             The displacement.
         """
+        # The first step is the rest before the record.
+        return self.begin(float(v[0]), rng)(np.diff(t, prepend=t[0] - _REST_S), v)
+
+    def begin(self, v0: float, rng: np.random.Generator) -> Continued:
+        """Return the stage, at the voltage `v0` (V) after negative saturation, to be continued piece by piece."""
         attempts = self.attempts * 10.0 ** rng.uniform(-0.5, 0.5)
         share, width = _specimen(rng, self.share), _specimen(rng, self.width)
         growth, slope = _specimen(rng, self.width_growth), _specimen(rng, self.bias_slope)
         up, down, weights = _density(self.relays, width, growth, slope)
-        p = (up < v[0]).astype(np.float64)
-        # The first step is the rest before the record.
-        durations = np.diff(t, prepend=t[0] - _REST_S)
-        scale = _within(up, down, weights)
-        seen = flipped(durations, v, p, up, down, weights / scale, attempts, self.thermal)
-        return self.stroke * (share * seen + (1.0 - share) * v / 100.0)
+        p, last = (up < v0).astype(np.float64), np.array([v0])
+        weights = weights / _within(up, down, weights)
+
+        def continued(durations: FloatArray, v: FloatArray) -> FloatArray:
+            seen = flipped(durations, v, p, up, down, weights, attempts, self.thermal, float(last[0]))
+            last[0] = v[-1]
+            return np.asarray(self.stroke * (share * seen + (1.0 - share) * v / 100.0))
+
+        return continued
 
 
 @dataclass(frozen=True)
@@ -171,13 +183,27 @@ class MaxwellSlip:
         ndarray, shape (N,), metres
             The displacement.
         """
+        return self.begin(float(v[0]), rng)(np.diff(t, prepend=t[0]), v)
+
+    def begin(self, v0: float, rng: np.random.Generator) -> Continued:
+        """Return the stage, with all elements relaxed at the voltage `v0` (V), to be continued piece by piece."""
         shares = np.array([_specimen(rng, share) for share in self.shares])
         breakaways = np.array([_specimen(rng, breakaway) for breakaway in self.breakaways])
         stribeck, time_constant = _specimen(rng, self.stribeck), _specimen(rng, self.viscous_time)
-        durations = np.diff(t, prepend=t[0])
-        lost = slipped(durations, v, shares, breakaways, self.kinetic, stribeck, self.attraction)
-        viscous = self.viscous_share * (v - _followed(durations, v, time_constant))
-        return self.gain * (v - lost - viscous)
+        deflection, slipping = np.zeros(shares.size), np.zeros(shares.size)
+        # Voltage of the preceding sample, and that of the dashpot.
+        last = np.array([v0, v0])
+
+        def continued(durations: FloatArray, v: FloatArray) -> FloatArray:
+            lost = slipped(
+                durations, v, deflection, slipping, shares, breakaways, self.kinetic, stribeck, self.attraction,
+                float(last[0]),
+            )  # fmt: skip
+            behind = _followed(np.append(0.0, durations), np.append(last[0], v), time_constant, float(last[1]))[1:]
+            last[:] = v[-1], behind[-1]
+            return np.asarray(self.gain * (v - lost - self.viscous_share * (v - behind)))
+
+        return continued
 
 
 @dataclass(frozen=True)
@@ -369,13 +395,24 @@ class MovingPreisach:
         ndarray, shape (N,), metres
             The displacement.
         """
+        return self.begin(float(v[0]), rng)(np.diff(t, prepend=t[0]), v)
+
+    def begin(self, v0: float, rng: np.random.Generator) -> Continued:
+        """Return the stage, at the voltage `v0` (V) after negative saturation, to be continued piece by piece."""
         share, moving, settling = (_specimen(rng, x) for x in (self.share, self.moving, self.settling))
         width = _specimen(rng, self.width)
         growth, slope = _specimen(rng, self.width_growth), _specimen(rng, self.bias_slope)
         up, down, weights = _density(self.relays, width, growth, slope)
         weights = share * weights / _within(up, down, weights)
-        z = moved(np.diff(t, prepend=t[0]), v, up, down, weights, (1.0 - share) / 100.0, 100.0 * moving, settling)
-        return self.stroke * z
+        gain, state, felt = (1.0 - share) / 100.0, np.zeros(up.size, dtype=np.bool_), np.zeros(1)
+        # The first sample settles at once.
+        moved(np.array([np.inf]), np.array([v0]), state, felt, up, down, weights, gain, 100.0 * moving, settling)
+
+        def continued(durations: FloatArray, v: FloatArray) -> FloatArray:
+            z = moved(durations, v, state, felt, up, down, weights, gain, 100.0 * moving, settling)
+            return np.asarray(self.stroke * z)
+
+        return continued
 
 
 def _specimen(rng: np.random.Generator, value: float) -> float:
@@ -403,9 +440,9 @@ def _within(up: FloatArray, down: FloatArray, weights: FloatArray) -> float:
     return float(np.sum(weights[(up < 100.0) & (down > 0.0)]))
 
 
-def _followed(durations: FloatArray, v: FloatArray, time_constant: float) -> FloatArray:
-    """Return `v` (V), linear between samples, after a first-order low-pass filter that starts at rest."""
-    out, now, before = np.empty_like(v), float(v[0]), float(v[0])
+def _followed(durations: FloatArray, v: FloatArray, time_constant: float, start: float | None = None) -> FloatArray:
+    """Return `v` (V), linear between samples, after a first-order low-pass filter at `start` (V); default: at rest."""
+    out, now, before = np.empty_like(v), float(v[0]) if start is None else start, float(v[0])
     for index, (duration, voltage) in enumerate(zip(durations.tolist(), v.tolist(), strict=True)):
         # The filter's distance from its input, driven by a ramp, in closed form.
         behind = now - before
@@ -427,13 +464,14 @@ def flipped(
     weights: FloatArray,
     attempts: float,
     thermal: float,
+    before: float,
 ) -> FloatArray:
     """Return the weighted sum of thermally activated relays, shape (N,); `p` is their state and is modified.
 
     Parameters
     ----------
     durations : ndarray, shape (N,), seconds
-        From the preceding sample; the first one is spent at ``v[0]``.
+        From the preceding sample.
     v : ndarray, shape (N,), volts
         Voltage, linear between samples.
     p : ndarray, shape (M,)
@@ -444,10 +482,12 @@ def flipped(
         Contribution of each class to the sum.
     attempts, thermal : float, 1/s and volts
         As in `ThermalRelays`.
+    before : float, volts
+        Voltage of the preceding sample.
     """
     out = np.empty_like(v)
     for n in range(v.size):
-        last = v[n - 1] if n else v[n]
+        last = v[n - 1] if n else before
         middle, half = 0.5 * (v[n] + last), 0.5 * (v[n] - last) / thermal
         # Mean of an exponential over a linear step, relative to its value at mid-step.
         mean = math.sinh(half) / half if abs(half) > 1e-6 else 1.0
@@ -469,13 +509,18 @@ def flipped(
 def slipped(
     durations: FloatArray,
     v: FloatArray,
+    deflection: FloatArray,
+    slipping: FloatArray,
     shares: FloatArray,
     breakaways: FloatArray,
     kinetic: float,
     stribeck: float,
     attraction: float,
+    before: float,
 ) -> FloatArray:
     """Return the weighted sum of the deflections of Maxwell-slip elements, shape (N,), volts.
+
+    `deflection` (V) and `slipping` (direction, or 0), shape (M,), are their state and are modified.
 
     Parameters
     ----------
@@ -485,11 +530,12 @@ def slipped(
     shares, breakaways : ndarray, shape (M,), dimensionless and volts
     kinetic, stribeck, attraction : float
         As in `MaxwellSlip`.
+    before : float, volts
+        Voltage of the preceding sample.
     """
-    out, deflection = np.empty_like(v), np.zeros(shares.size)
-    slipping = np.zeros(shares.size)
+    out = np.empty_like(v)
     for n in range(v.size):
-        dv = v[n] - v[n - 1] if n else 0.0
+        dv = v[n] - (v[n - 1] if n else before)
         way = 1.0 if dv > 0.0 else -1.0
         total = 0.0
         if dv != 0.0 and durations[n] > 0.0:
@@ -518,6 +564,8 @@ def slipped(
 def moved(
     durations: FloatArray,
     v: FloatArray,
+    state: NDArray[np.bool_],
+    felt: FloatArray,
     up: FloatArray,
     down: FloatArray,
     weights: FloatArray,
@@ -527,13 +575,16 @@ def moved(
 ) -> FloatArray:
     """Return the displacement of the moving Preisach model, shape (N,), in strokes.
 
+    `state`, shape (M,), whether each relay is up, and `felt`, shape (1,), the displacement (strokes) that acts back, are
+    modified.
+
     Parameters
     ----------
     durations : ndarray, shape (N,), seconds
         From the preceding sample.
     v : ndarray, shape (N,), volts
     up, down : ndarray, shape (M,), volts
-        Thresholds of the relays; all relays are down before the first sample.
+        Thresholds of the relays.
     weights : ndarray, shape (M,), strokes
     gain : float, 1/V
         Linear part, strokes per volt.
@@ -542,10 +593,9 @@ def moved(
     settling : float, seconds
         Time constant with which the displacement acts back.
     """
-    out, state = np.empty_like(v), np.zeros(up.size, dtype=np.bool_)
-    felt = 0.0
+    out = np.empty_like(v)
     for n in range(v.size):
-        field, total = v[n] + moving * felt, gain * v[n]
+        field, total = v[n] + moving * felt[0], gain * v[n]
         for k in range(up.size):
             if field >= up[k]:
                 state[k] = True
@@ -554,5 +604,5 @@ def moved(
             if state[k]:
                 total += weights[k]
         out[n] = total
-        felt = total + (felt - total) * math.exp(-durations[n] / settling) if n else total
+        felt[0] = total + (felt[0] - total) * math.exp(-durations[n] / settling)
     return out

@@ -1,0 +1,314 @@
+"""Paths that repeat on stages whose physics is not the model's: learning, beside feedforward, feedback and another learning.
+
+Each stage has hysteresis of ``hidden/foreign.py`` (thermally activated relays, Maxwell slip, moving Preisach), creep, a
+lag, a flexure mode of 150 to 900 Hz with damping 0.005 to 0.05, and drift; its sensor has 2 to 20 nm of noise. The
+model is identified from records of its own, with what ``slpi diagnose`` finds; nothing of the stage is given. Then it
+follows one path again and again:
+
+- ``feedforward``: the inverse alone;
+- ``PI``: the inverse and feedback with the best of several gains;
+- ``line``: the error of each pass is added to the path of the next one, low-passed without a phase, with the best of
+  several gains and bandwidths; this is what learning through a straight line reaches;
+- ``learner``: `slpi_ros.Learner`.
+
+Printed is the **true** error, rms in nm, without the mean of the pass: of the first pass, and after 5 and `--passes`
+passes; the best gains are those with the least error after the last pass. Marks: ``NOISE`` where the last pass is above the
+sensor's noise, ``TENTH`` where it is above a tenth of the first although there was room, ``LINE`` where after 5 passes
+it is above a third of ``line``, and ``HARM`` where any pass is more than a tenth worse than the first.
+"""
+
+import argparse
+import math
+import sys
+import time
+import warnings
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from hidden import foreign
+from numpy.typing import NDArray
+from scipy.signal import cont2discrete, lfilter
+
+import slpi_ros
+from slpi_ros.excitation.drives import calibration_drive
+from slpi_ros.io.record import Record
+
+FloatArray = NDArray[np.float64]
+
+RATE_HZ, HIGHEST_V = 4000.0, 100.0
+KINDS = {
+    "relays": foreign.ThermalRelays(relays=900),
+    "Maxwell": foreign.MaxwellSlip(),
+    "Preisach": foreign.MovingPreisach(relays=2500),
+}
+# Duration (s) of the calibration records.
+RECORDS_S = (4.0, 0.6)
+# Gains and bandwidths (Hz) of the straight line; gains of the feedback, proportional and integral (1/s).
+LINE = [(gain, band) for gain in (0.3, 0.6, 1.0) for band in (40.0, 100.0, 250.0)]
+PI = [(p, i) for p in (0.0, 0.2) for i in (20.0, 80.0, 250.0)]
+PATHS = ("raster 1", "raster 5", "raster 20", "raster 40", "raster f/10", "sine", "steps", "free")
+# Share of the stroke that a path covers.
+SHARE = 0.6
+
+
+@dataclass(frozen=True)
+class Specimen:
+    """One stage: its class, its seed, and what is around the hysteresis."""
+
+    kind: str
+    seed: int
+    frequency: float  # Hz, of the flexure mode
+    damping: float
+    lag: float  # s
+    creep: float  # share of the displacement per decade
+    drift: float  # m/s
+    noise: float  # m
+
+    @classmethod
+    def draw(cls, seed: int) -> "Specimen":
+        """Draw the stage of a seed."""
+        rng = np.random.default_rng([48, seed])
+
+        def between(low: float, high: float) -> float:
+            return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+        kind = list(KINDS)[seed % len(KINDS)]
+        drift = float(rng.choice([0.0, 1.0])) * between(1e-9, 2e-8)
+        return cls(kind, seed, between(150, 900), between(0.005, 0.05), between(1e-4, 1.5e-3), between(2e-3, 1.5e-2),
+                   drift, between(2e-9, 20e-9))  # fmt: skip
+
+
+class Stage:
+    """A running stage: voltages in, displacement out, piece by piece."""
+
+    def __init__(self, specimen: Specimen, v0: float = 0.0) -> None:
+        self.specimen, dt = specimen, 1.0 / RATE_HZ
+        self._hysteresis = KINDS[specimen.kind].begin(v0, np.random.default_rng(specimen.seed))
+        w = 2.0 * np.pi * specimen.frequency
+        lag = cont2discrete(([1.0], [specimen.lag, 1.0]), dt, method="foh")
+        mode = cont2discrete(([w * w], [1.0, 2.0 * specimen.damping * w, w * w]), dt, method="foh")
+        # Creep: a relaxation in each half decade from 10 ms to 10 s.
+        times = 10.0 ** np.arange(-2.0, 1.01, 0.5)
+        creeps = [cont2discrete(([0.5 * specimen.creep], [tau, 1.0]), dt, method="foh") for tau in times]
+        self._lag, self._mode, self._creep = [lag[:2]], [mode[:2]], [each[:2] for each in creeps]
+        settled = self._hysteresis(np.array([1.0]), np.array([v0]))[0]
+        gains = 1.0 + 0.5 * specimen.creep * len(times)
+        self._states = {
+            "lag": [_settled(self._lag[0], v0)],
+            "creep": [_settled(each, settled) for each in self._creep],
+            "mode": [_settled(self._mode[0], settled * gains)],
+        }
+        self.t = 0.0
+
+    def run(self, v: FloatArray) -> FloatArray:
+        """Return the displacement (m, (N,)) for voltages (V, (N,))."""
+        v = self._through("lag", self._lag, v)
+        x = self._hysteresis(np.full(v.size, 1.0 / RATE_HZ), v)
+        x = x + self._through("creep", self._creep, x)
+        x = self._through("mode", self._mode, x)
+        t = self.t + (1.0 + np.arange(v.size)) / RATE_HZ
+        self.t = float(t[-1])
+        return x + self.specimen.drift * t
+
+    def _through(self, name: str, filters: list[tuple[FloatArray, FloatArray]], x: FloatArray) -> FloatArray:
+        out = np.zeros(x.size)
+        for k, (numerator, denominator) in enumerate(filters):
+            y, self._states[name][k] = lfilter(np.ravel(numerator), denominator, x, zi=self._states[name][k])
+            out += y
+        return out
+
+
+def _settled(system: tuple[FloatArray, FloatArray], value: float) -> FloatArray:
+    """Return the state of a filter at rest at an input."""
+    from scipy.signal import lfilter_zi
+
+    return np.asarray(lfilter_zi(np.ravel(system[0]), system[1]) * value)
+
+
+def identified(specimen: Specimen, kept: Path | None) -> slpi_ros.StageModel:
+    """Return the model with causes of a stage, identified from its own records; `kept`: folder of models made before."""
+    file = kept / f"{specimen.seed}.json" if kept else None
+    if file and file.exists():
+        return slpi_ros.load_model(file)
+    noise, records = np.random.default_rng([7, specimen.seed]), []
+    for number, duration in enumerate(RECORDS_S):
+        v = calibration_drive(0.0, HIGHEST_V, duration=duration, rate=RATE_HZ, seed=10 * specimen.seed + number)[1]
+        x = Stage(specimen).run(v)
+        time_ns = np.round((3600.0 * number + np.arange(v.size) / RATE_HZ) * 1e9).astype(np.int64)
+        y = x + specimen.noise * noise.standard_normal(x.size)
+        records.append(Record(time_ns, {"x": v}, {"x": y}, source=f"record {number + 1}"))
+    model = slpi_ros.diagnose(records, slpi_ros.identify(records)).extended
+    if file:
+        slpi_ros.save_model(model, file)
+    return model
+
+
+def path_of(name: str, specimen: Specimen, axis: slpi_ros.AxisModel) -> FloatArray:
+    """Return one pass (m, (N,)) of a path, within the range of the stage."""
+    low, high = axis.displacement_range
+    middle, half = 0.5 * (low + high), 0.5 * SHARE * (high - low)
+    if name == "steps":
+        edges = np.repeat([0.0, 0.6, -0.4, 0.9, -0.8, 0.0], round(0.08 * RATE_HZ))
+        return middle + half * np.convolve(np.pad(edges, 40, "wrap"), np.hanning(81) / np.hanning(81).sum(), "valid")
+    if name == "free":
+        rng, n = np.random.default_rng([5, specimen.seed]), round(0.8 * RATE_HZ)
+        x = np.fft.irfft(np.fft.rfft(rng.standard_normal(n)) * (np.fft.rfftfreq(n, 1 / RATE_HZ) < 12.0), n)
+        x = x / np.abs(x).max() * np.sin(np.pi * np.arange(n) / n)
+        return middle + half * x + 0.4 * half * (np.arange(n) / n - 0.5)
+    hertz = {"sine": 15.0, "raster f/10": 0.1 * specimen.frequency}.get(name) or float(name.split()[1])
+    n = round(RATE_HZ / hertz)
+    if name == "sine":
+        return middle - half * np.cos(2.0 * np.pi * np.arange(n) / n)
+    # Turns that are rounded over a few per cent of the period, as every scanner's are.
+    spectrum = np.fft.rfft(2.0 * np.abs(2.0 * np.arange(n) / n - 1.0) - 1.0)
+    return middle - half * np.fft.irfft(spectrum * np.exp(-((0.08 * np.arange(spectrum.size)) ** 2)), n)
+
+
+class Run:
+    """Passes of one path on one stage, through the inverse of the model."""
+
+    def __init__(self, specimen: Specimen, axis: slpi_ros.AxisModel, desired: FloatArray) -> None:
+        self.specimen, self.desired, self.stage = specimen, desired, Stage(specimen)
+        self.stream = axis.stream(start_memory="start")
+        self._noise = np.random.default_rng([3, specimen.seed])
+        self._at = 0.0
+        rest = self.stream.uncoupled_displacement
+        lead = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, round(0.5 * RATE_HZ)))
+        self.closed = abs(desired[0] - desired[-1]) < 1e-7
+        self.follow(rest + (desired[0] - rest) * lead)
+
+    def follow(self, path: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return voltage (V), true and measured displacement (m), (N,), for a path (m, (N,))."""
+        v = np.empty(path.size)
+        for k, y in enumerate(path.tolist()):
+            self._at += 1.0 / RATE_HZ
+            v[k] = self.stream.step(self._at, y)
+        x = self.stage.run(v)
+        return v, x, x + self.specimen.noise * self._noise.standard_normal(x.size)
+
+    def back(self) -> None:
+        """Lead a path that does not close back to its beginning."""
+        if not self.closed:
+            share = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, round(0.3 * RATE_HZ)))
+            self.follow(self.desired[-1] + (self.desired[0] - self.desired[-1]) * share)
+
+    def feedback(self, proportional: float, integral: float) -> FloatArray:
+        """Return the true displacement (m, (N,)) of a pass with feedback on the path."""
+        true, correction, total, read = np.empty(self.desired.size), 0.0, getattr(self, "_total", 0.0), None
+        for k, y in enumerate(self.desired.tolist()):
+            if read is not None:
+                error = self.desired[k - 1] - read
+                total += integral / RATE_HZ * error
+                correction = float(np.clip(proportional * error + total, -5e-6, 5e-6))
+            self._at += 1.0 / RATE_HZ
+            true[k] = self.stage.run(np.array([self.stream.step(self._at, y + correction)]))[0]
+            read = true[k] + self.specimen.noise * float(self._noise.standard_normal())
+        self._total = total
+        return true
+
+
+def rms(x: FloatArray, desired: FloatArray, judged: FloatArray) -> float:
+    """Return the rms error (nm) without its mean over the judged samples."""
+    error = (x - desired)[judged > 0.5]
+    return float(1e9 * np.std(error))
+
+
+def judged_of(name: str, specimen: Specimen, desired: FloatArray) -> FloatArray:
+    """Return which samples count, (N,), 1 or 0: of steps, those five settling times of the mode after each."""
+    judged = np.ones(desired.size)
+    if name == "steps":
+        settling = min(round(5.0 / (specimen.damping * 2.0 * np.pi * specimen.frequency) * RATE_HZ), 280)
+        moving = np.append(0.0, np.abs(np.diff(desired)) > 1e-10)
+        judged = (np.convolve(moving, np.ones(settling))[: desired.size] < 0.5).astype(float)
+    return judged
+
+
+def compare(specimen: Specimen, axis: slpi_ros.AxisModel, name: str, passes: int, beside: bool) -> dict[str, list[float]]:
+    """Return the true error (nm) of every pass with each method."""
+    desired = path_of(name, specimen, axis)
+    judged, t = judged_of(name, specimen, desired), np.arange(desired.size) / RATE_HZ
+    run, learner = Run(specimen, axis, desired), slpi_ros.Learner(slpi_ros.StageModel({"x": axis}), t, desired)
+    errors: dict[str, list[float]] = {"learner": []}
+    for _ in range(passes):
+        v, x, y = run.follow(learner.path())
+        errors["learner"].append(rms(x, desired, judged))
+        report = learner.update(y, v)
+        run.back()
+        if "-v" in sys.argv and report.reason:
+            print(f"      pass {report.number}: {report.reason}")
+    errors["limited"] = [report.limited_by]  # type: ignore[list-item]
+    errors["bandwidth"] = [report.bandwidth]
+    if not beside:
+        return errors
+    tried: list[list[float]] = []
+    for gain, band in LINE:
+        run, correction, found = Run(specimen, axis, desired), np.zeros(desired.size), []
+        low_pass = np.exp(-0.5 * (np.fft.rfftfreq(desired.size, 1.0 / RATE_HZ) / band) ** 2)
+        low_pass[0] = 0.0
+        for _ in range(passes):
+            _, x, y = run.follow(np.clip(desired + correction, *axis.displacement_range))
+            run.back()
+            found.append(rms(x, desired, judged))
+            correction = correction + gain * np.fft.irfft(np.fft.rfft(desired - y) * low_pass, desired.size)
+        tried.append(found)
+    errors["line"] = min(tried, key=lambda found: found[-1])
+    tried = []
+    for proportional, integral in PI:
+        run = Run(specimen, axis, desired)
+        if desired.size * 5 > 30_000:
+            break
+        tried.append([rms(run.feedback(proportional, integral), desired, judged) for _ in range(5)])
+    errors["PI"] = min(tried, key=lambda found: found[-1]) if tried else [math.nan]
+    return errors
+
+
+def main() -> int:
+    """Print a row for each stage and path, and what share keeps the marks; return 1 if one is missed."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--count", type=int, default=3, help="stages")
+    parser.add_argument("--seed", type=int, default=0, help="of the first stage")
+    parser.add_argument("--passes", type=int, default=20)
+    parser.add_argument("--paths", nargs="+", choices=PATHS, default=["raster 5", "raster 20", "raster f/10", "free"])
+    parser.add_argument("--all-paths", action="store_true", help="every path")
+    parser.add_argument("--alone", action="store_true", help="the learner alone")
+    parser.add_argument("--models", type=Path, help="folder in which identified models are kept")
+    parser.add_argument("-v", action="store_true", help="tell what happened in which pass")
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    print(f"true error, rms nm, without mean; after 5 and {options.passes} passes")
+    print(f"{'stage':<34}{'path':<12}{'noise':>6}{'first':>8}{'PI':>8}{'line 5':>8}{'last':>8}{'learner 5':>10}{'last':>8}")
+    counts = {"NOISE": 0, "TENTH": 0, "LINE": 0, "HARM": 0}
+    rows = 0
+    for seed in range(options.seed, options.seed + options.count):
+        specimen = Specimen.draw(seed)
+        began = time.perf_counter()
+        axis = identified(specimen, options.models).axes["x"]
+        causes = ", ".join(effect.name for effect in axis.effects) or "no effect"
+        print(f"{seed}: {specimen.kind}, mode {specimen.frequency:.0f} Hz damping {specimen.damping:.3f}, "
+              f"lag {1e3 * specimen.lag:.2f} ms; found: {causes}  ({time.perf_counter() - began:.0f} s)", flush=True)  # fmt: skip
+        for name in PATHS if options.all_paths else options.paths:
+            errors = compare(specimen, axis, name, options.passes, not options.alone)
+            own, line, noise = errors["learner"], errors.get("line"), 1e9 * specimen.noise
+            marks = []
+            if own[-1] > noise:
+                marks.append("NOISE")
+            if own[-1] > max(0.1 * own[0], noise):
+                marks.append("TENTH")
+            if line and own[min(5, len(own) - 1)] > max(line[min(5, len(line) - 1)] / 3.0, noise):
+                marks.append("LINE")
+            if max(own) > 1.1 * own[0] + noise / 3.0:
+                marks.append("HARM")
+            for mark in marks:
+                counts[mark] += 1
+            rows += 1
+            fifth = f"{line[min(5, len(line) - 1)]:>8.1f}{line[-1]:>8.1f}" if line else f"{'':>16}"
+            print(f"{'':<34}{name:<12}{noise:>6.1f}{own[0]:>8.1f}{errors.get('PI', [math.nan])[-1]:>8.1f}{fifth}"
+                  f"{own[min(5, len(own) - 1)]:>10.1f}{own[-1]:>8.1f}  {errors['limited'][0]} {errors['bandwidth'][0]:.0f} Hz"
+                  f"  {' '.join(marks)}", flush=True)  # fmt: skip
+    print("; ".join(f"{mark} {count} of {rows}" for mark, count in counts.items()))
+    return 1 if counts["NOISE"] > 0.1 * rows or counts["TENTH"] or counts["LINE"] or counts["HARM"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

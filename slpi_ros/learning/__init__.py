@@ -1,0 +1,1 @@
+"""Paths that repeat: the correction of the next pass from the last ones."""

@@ -1,0 +1,409 @@
+"""One axis of a path that repeats: from each pass to the correction of the next one, and the rules that keep it safe."""
+
+import hashlib
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from slpi_ros.arrays import FloatArray, Mask
+from slpi_ros.errors import ModelError, length
+from slpi_ros.learning.first_guess import first_guess
+from slpi_ros.learning.harmonics import ComplexArray, Harmonics
+from slpi_ros.learning.passes import Judged, agreed, judge
+from slpi_ros.model.axis_model import AxisModel
+
+# Gain of a step towards the desired path, at first.
+GAIN = 0.8
+# A pass is worse than the best from this ratio of their errors on, beyond this many standard deviations of the noise.
+WORSE, WORSE_BY_NOISE = 1.1, 4.0
+# Times that learning goes back to the best pass without a better one since, and passes in a row that cannot be learned
+# from, until it is held.
+MOST_RETURNS, MOST_REFUSED = 2, 3
+# Passes after which the best one is forgotten, as the stage is another one by then.
+BEST_PASSES = 50
+# Largest part of the stroke that learning may add to the desired path, by default.
+LIMIT_SHARE = 0.25
+# A path closes if its ends differ by less than this many of its largest steps; otherwise it is led back to its beginning
+# over this share of it, and the correction begins and ends at 0, over this share.
+CLOSING_STEPS, LED_BACK, TAPER = 1.5, 0.25, 0.02
+# Samples in a row at a voltage limit that count as held there, and share of the range by which it is reached.
+HELD_SAMPLES, AT_LIMIT = 3, 1e-6
+# Hashes of passes that are kept to find a replayed one, and passes whose figures are kept.
+KEPT_HASHES, KEPT_PASSES = 64, 10_000
+# Largest answer to a change of the path that is still taken for one, as a multiple of the change.
+ANSWER = 5.0
+# A change has settled where a pass differs from the one before by this share of what it has changed; most passes that
+# are waited for. Before that, a pass that is so much worse than the best leads back at once.
+SETTLED, MOST_DWELL, AT_ONCE = 0.2, 6, 1.5
+# A harmonic's error counts beyond this many standard deviations.
+CLEAR = 2.0
+
+
+@dataclass(frozen=True)
+class PassReport:
+    """Figures of one pass of one axis.
+
+    `error` is what repeats and can be learned: rms of measured - desired without the mean and the drift of the pass, which
+    are `offset` (m) and `drift` (m over the pass); `absolute` is the rms with both. `bumps`: samples left out as a bump.
+    `reason`: why the pass was not learned from, or what it led to; "" if it was learned from. `limited_by`: what keeps
+    the error where it is. `bandwidth` (Hz): below it the phase of every harmonic is known.
+    """
+
+    number: int
+    error: float
+    absolute: float
+    offset: float
+    drift: float
+    bumps: int
+    learned: bool
+    reason: str
+    limited_by: str
+    bandwidth: float
+
+
+@dataclass(frozen=True)
+class _Best:
+    number: int
+    power: float  # m^2, mean square error
+    correction: FloatArray
+
+
+class AxisLearner:
+    """The state of learning of one axis; see `Learner`."""
+
+    def __init__(
+        self, axis: AxisModel, dt: float, desired: FloatArray, limit: float | None, voltage: tuple[float, float]
+    ) -> None:
+        self.axis, self.dt, self.desired, self.voltage = axis, dt, desired, voltage
+        low, high = axis.displacement_range
+        self.limit = LIMIT_SHARE * (high - low) if limit is None else limit
+        steps = np.abs(np.diff(desired))
+        self.closed = bool(abs(desired[0] - desired[-1]) <= CLOSING_STEPS * float(steps.max(initial=0.0)))
+        self.taper = np.ones(desired.size)
+        if not self.closed:
+            edge = max(2, int(TAPER * desired.size))
+            rise = 0.5 - 0.5 * np.cos(np.pi * np.arange(edge) / edge)
+            self.taper[:edge], self.taper[-edge:] = rise, rise[::-1]
+        self.wanted = self._spectrum(desired)
+        self.frequency = np.fft.rfftfreq(self._size, dt)
+        self.correction = np.zeros(desired.size)
+        self.passes: list[PassReport] = []
+        self.gain, self.held, self.returns, self.refused = GAIN, "", 0, 0
+        self.record = math.inf  # m^2, least mean square error of a pass so far
+        self.best: _Best | None = None
+        self._deviating: Mask | None = None
+        self._last = np.zeros(desired.size)  # correction of the pass before
+        self._offset: float | None = None
+        self._hashes: list[str] = []
+        self._clipped = self._told = ""
+        # Readings (m) of the pass before, and of that before the last change of the path; passes since, and how many it
+        # takes until they have settled.
+        self._previous: FloatArray | None = None
+        self._changed: FloatArray | None = None
+        self._since = 0
+        self._dwell: int | None = None
+        self._lead_in: FloatArray | None = None
+        self._returned = False  # the next pass is that of the best path again
+        noise = np.full(self.frequency.size, self._size * max(axis.quality.floor_rms, 1e-12) ** 2)
+        guess, variance = first_guess(axis, dt, self.frequency)
+        self.harmonics = Harmonics.first(guess, variance, noise)
+
+    @property
+    def path(self) -> FloatArray:
+        """The desired path of the next pass, (N,), metres."""
+        low, high = self.axis.displacement_range
+        low, high = min(low, float(self.desired.min())), max(high, float(self.desired.max()))
+        return np.asarray(np.clip(self.desired + self.correction, low, high))
+
+    @property
+    def noise(self) -> float:
+        """Standard deviation of one reading from pass to pass, metres."""
+        return math.sqrt(self._power(self.harmonics.noise))
+
+    def update(self, measured: FloatArray, voltage: FloatArray | None = None) -> PassReport:
+        """Learn from a pass with the present `path`; `measured` (m), `voltage` (V), shape (N,)."""
+        seen = self.axis.correct(np.arange(measured.size) * self.dt, measured) if self.axis.corrects else measured
+        first = not self.harmonics.passes
+        correction = self._spectrum(self.correction)
+        expected = self.desired if first else self._signal(self.harmonics.expected(correction))
+        floor = math.sqrt(self._power(np.full(self.frequency.size, self.harmonics.noise.min())))
+        change = self._spectrum(self.correction - self._last)
+        own = ANSWER**2 * self._power(np.abs(change) ** 2)
+        power = own + self._power(self.harmonics.variance(correction) + self.harmonics.noise) if not first else math.inf
+        error = self.passes[-1].error if self.passes else math.inf
+        if self._previous is not None and not change.any():
+            # The same path again: the same reading, but for what is still settling.
+            expected, power = self._previous, 2.0 * self.noise**2
+        judged = judge(seen, expected, math.sqrt(power), floor, self._deviating, error)
+        if self._lead_in is not None and not judged.reason:
+            judged = agreed(self._lead_in, judged, self.desired, floor)
+        reason = judged.reason or self._replayed(measured) or self._held_back(voltage)
+        offset, drift = self._offset_and_drift(judged, expected, first=first)
+        clean = judged.measured - offset - drift * (np.arange(measured.size) / measured.size - 0.5)
+        rest = (clean - self.desired)[np.isfinite(clean)]
+        whole = (seen - self.desired)[np.isfinite(seen)]
+        rms, absolute = (float(np.sqrt(np.mean(x**2))) if x.size else 0.0 for x in (rest, whole))
+        if reason:
+            self._refuse(reason, new=bool(change.any()))
+        else:
+            self._learn(correction, clean, judged, rms)
+            self._offset = offset
+        report = PassReport(
+            len(self.passes) + 1, rms, absolute, offset, drift, int(np.count_nonzero(judged.bumps)), not reason,
+            reason or self._told, self.held or self.limited_by(drift), self.bandwidth,
+        )  # fmt: skip
+        self.passes.append(report)
+        del self.passes[:-KEPT_PASSES]
+        return report
+
+    def _learn(self, correction: ComplexArray, clean: FloatArray, judged: Judged, rms: float) -> None:
+        self._told, self.refused = "", 0
+        if self._lead_in is None and not self.passes:
+            # The first pass comes from rest, and nothing was there to compare it with: no step is made for it.
+            self._lead_in = clean
+            self._told = "the first pass: compared with the next"
+            return
+        lead_in, self._lead_in = self._lead_in, None
+        settled = self._settled(clean)
+        self._deviating, self._last = judged.deviating, self.correction
+        if not settled and not (self.best and rms**2 > AT_ONCE**2 * self.best.power + self._scatter()):
+            self._told = "its changes are still settling"
+            return
+        h, seen = self.harmonics, self._spectrum(clean)
+        if h.passes:
+            self.harmonics = h.after(correction, seen)
+        else:
+            self.harmonics = h.begun(self.wanted + correction, seen, seen if lead_in is None else self._spectrum(lead_in))
+        number, best = len(self.passes) + 1, self.best
+        if best is not None and number - best.number > BEST_PASSES:
+            best = None
+        again = best is not None and self._returned
+        self._returned = False
+        if best is not None and again:
+            # The best path once more: its error was lucky, or what has come between is still settling.
+            self.best = replace(best, power=max(best.power, 0.5 * (best.power + rms**2)))
+        elif best is None or rms**2 < best.power:
+            if rms**2 < self.record - self._scatter():
+                self.returns = 0
+            self.record = min(self.record, rms**2)
+            self.best = _Best(number, rms**2, self.correction)
+        elif rms**2 > WORSE**2 * best.power + self._scatter():
+            self._return(f"worse than pass {best.number}: {length(rms)} after {length(math.sqrt(best.power))}")
+            return
+        if not self.held:
+            self._step(correction)
+
+    def _settled(self, clean: FloatArray) -> bool:
+        """Return whether the answer to the last change of the path has settled: a lightly damped mode rings for passes.
+
+        The first change of the path is followed until a pass is like the one before; later ones as many passes.
+        """
+        if (self.correction != self._last).any():
+            self._since, self._changed = 0, self._previous
+        self._since, before = self._since + 1, self._previous
+        self._previous = clean
+        if self._changed is None or before is None:
+            return True
+        if self._since > 1 and self._dwell is None:
+            moved, answered = (float(np.var(clean - other)) for other in (before, self._changed))
+            if moved < max(SETTLED**2 * answered, 4.0 * self.noise**2) or self._since > MOST_DWELL:
+                self._dwell = self._since - 1
+        return self._dwell is not None and self._since >= self._dwell
+
+    def _step(self, correction: ComplexArray) -> None:
+        step = self._signal(self.harmonics.step(correction, self.wanted, self.gain)) * self.taper
+        wanted = self.correction + step
+        allowed = np.clip(wanted, -self.limit, self.limit)
+        low, high = self.axis.displacement_range
+        inside = np.clip(self.desired + allowed, min(low, self.desired.min()), max(high, self.desired.max()))
+        reached = inside - self.desired
+        beyond = np.abs(reached - allowed) > 1e-12
+        self._clipped = "learn_limit" if (allowed != wanted).any() else "voltage range" if beyond.any() else ""
+        self.correction = reached
+
+    def _return(self, why: str) -> None:
+        """Go back to the best pass with half the gain; the second time without a better one since, hold."""
+        assert self.best is not None
+        self.correction, self.gain, self.returns = self.best.correction, 0.5 * self.gain, self.returns + 1
+        self._returned = True
+        self._told = f"{why}; back to the best, at half the gain"
+        if self.returns >= MOST_RETURNS:
+            self.held = f"held: {why}, for the second time"
+
+    def _refuse(self, reason: str, *, new: bool) -> None:
+        """Leave a pass alone, and go back to the best path from a new one; after several in a row, hold."""
+        self._told = reason
+        self.refused += 1
+        if self.best is not None and (new or self.refused >= MOST_REFUSED):
+            self.correction, self._returned = self.best.correction, True
+        if self.refused >= MOST_REFUSED:
+            self.held = f"held: {MOST_REFUSED} passes in a row were not learned from, the last as {reason}"
+
+    def limited_by(self, drift: float) -> str:
+        """Return what keeps the error where it is: noise, bandwidth, learn_limit, voltage range, drift, or learning."""
+        if self._clipped:
+            return self._clipped
+        left, harmonics = self.left, self.harmonics
+        sure = np.abs(left) ** 2 > CLEAR**2 * (harmonics.variance(self._spectrum(self.correction)) + harmonics.noise)
+        known = harmonics.phase_known
+        power = np.abs(left) ** 2
+        learnable, beyond = self._power(power * (sure & known)), self._power(power * (sure & ~known))
+        if max(learnable, beyond) < self.noise**2:
+            return "drift" if abs(drift) > self.noise else "noise"
+        return "bandwidth" if beyond > learnable else "not yet learned"
+
+    @property
+    def left(self) -> ComplexArray:
+        """Expected error of the next pass by harmonic, (K,), metres (as `numpy.fft.rfft`), without the mean."""
+        left = self.wanted - self.harmonics.expected(self._spectrum(self.correction))
+        left[0] = 0.0
+        return np.asarray(left)
+
+    @property
+    def bandwidth(self) -> float:
+        """Frequency (Hz) below which the phase of every harmonic is known."""
+        unknown = np.flatnonzero(~self.harmonics.phase_known[1:]) + 1
+        return float(self.frequency[unknown[0] if unknown.size else -1])
+
+    def forget(self) -> None:
+        """Begin anew from the desired path."""
+        self.__init__(self.axis, self.dt, self.desired, self.limit, self.voltage)  # type: ignore[misc]
+
+    @property
+    def _size(self) -> int:
+        return self.desired.size + (0 if self.closed else max(16, int(LED_BACK * self.desired.size)))
+
+    def _spectrum(self, x: FloatArray) -> ComplexArray:
+        """Return the harmonics of a signal (m, (N,)), led back to its beginning if the path does not close."""
+        count = self._size - x.size
+        if count:
+            share = 0.5 - 0.5 * np.cos(np.pi * (np.arange(count) + 1.0) / (count + 1.0))
+            x = np.concatenate([x, x[-1] + (x[0] - x[-1]) * share])
+        return np.asarray(np.fft.rfft(x))
+
+    def _signal(self, spectrum: ComplexArray) -> FloatArray:
+        return np.asarray(np.fft.irfft(spectrum, self._size)[: self.desired.size])
+
+    def _power(self, power: FloatArray) -> float:
+        """Return the mean square (m^2) of a signal with these squares of harmonics (m^2, (K,)), without the mean."""
+        twice = np.full(power.size, 2.0)
+        if self._size % 2 == 0:
+            twice[-1] = 1.0
+        return float((twice * power)[1:].sum()) / self._size**2
+
+    def _scatter(self) -> float:
+        """Return by how much (m^2) the mean square error of a pass may differ by its noise."""
+        noise = self.harmonics.noise[1:]
+        freedom = 2.0 * float(noise.sum()) ** 2 / float((noise**2).sum())
+        return WORSE_BY_NOISE * self.noise**2 * math.sqrt(2.0 / freedom)
+
+    def _offset_and_drift(self, judged: Judged, expected: FloatArray, *, first: bool) -> tuple[float, float]:
+        """Return mean error (m) and drift over the pass (m).
+
+        The drift is what both the mean against the pass before and the slope within this pass say, whichever is less.
+        """
+        known = np.isfinite(judged.measured)
+        if not known.any():
+            return 0.0, 0.0
+        offset = float(np.mean((judged.measured - self.desired)[known]))
+        if first or self._offset is None:
+            return offset, 0.0
+        shares = np.linspace(-0.5, 0.5, known.size)[known]
+        slope = float(np.polynomial.polynomial.polyfit(shares, (judged.measured - expected)[known], 1)[1])
+        moved = offset - self._offset
+        return offset, math.copysign(min(abs(slope), abs(moved)), moved) if slope * moved > 0.0 else 0.0
+
+    def _replayed(self, measured: FloatArray) -> str:
+        """Return that a pass is the copy of an earlier one, although another path was commanded; "" if not."""
+        known = hashlib.sha256(np.ascontiguousarray(measured).tobytes()).hexdigest()
+        path = hashlib.sha256(self.path.tobytes()).hexdigest()
+        earlier = [each.split(":")[1] for each in self._hashes if each.startswith(known)]
+        self._hashes = [*self._hashes, f"{known}:{path}"][-KEPT_HASHES:]
+        if any(each != path for each in earlier):
+            return "every reading is that of an earlier pass: the sensor's data are replayed"
+        return ""
+
+    def _held_back(self, voltage: FloatArray | None) -> str:
+        """Return that a limit held the voltage back; "" if none did, or the voltage is not known."""
+        if voltage is None:
+            return ""
+        (low, high), margin = self.voltage, AT_LIMIT * (self.voltage[1] - self.voltage[0])
+        at = (voltage <= low + margin) | (voltage >= high - margin)
+        runs = np.convolve(at, np.ones(HELD_SAMPLES), "valid") >= HELD_SAMPLES - 0.5
+        if not runs.any():
+            return ""
+        self._clipped = "voltage range"
+        return f"the voltage is held at a limit at {int(np.count_nonzero(at))} of its samples"
+
+    def to_document(self) -> dict[str, Any]:
+        """Return what was learned as a part of a document, metres and seconds."""
+        h = self.harmonics
+        return {
+            "desired_m": self.desired.tolist(),
+            "correction_m": self.correction.tolist(),
+            "last_correction_m": self._last.tolist(),
+            "learn_limit_m": self.limit,
+            "gain": self.gain,
+            "held": self.held,
+            "returns": self.returns,
+            "refused": self.refused,
+            "offset_m": self._offset,
+            "deviating": None if self._deviating is None else np.flatnonzero(self._deviating).tolist(),
+            "best": self.best
+            and {"number": self.best.number, "power_m2": self.best.power, "correction_m": self.best.correction.tolist()},
+            "hashes": self._hashes,
+            "harmonics": {
+                "gain": _pairs(h.gain),
+                "gain_variance": h.gain_variance.tolist(),
+                "without_m": _pairs(h.without),
+                "without_variance_m2": h.without_variance.tolist() if h.passes else [],
+                "covariance_m": _pairs(h.covariance),
+                "noise_m2": h.noise.tolist(),
+                "passes": h.passes,
+            },
+            "passes": [asdict(one) for one in self.passes],
+        }
+
+    def resume(self, document: Mapping[str, Any], *, same_model: bool) -> None:
+        """Go on from a document of the same path; of another model, only the correction of the path is taken over."""
+        correction = np.array(document["correction_m"])
+        if correction.shape != self.desired.shape:
+            raise ModelError(f"{correction.size} corrections for a path of {self.desired.size} samples; learn it anew")
+        low, high = -self.limit, self.limit
+        self.correction = self._last = np.clip(correction, low, high)
+        if not same_model:
+            return
+        numbers, h = document["harmonics"], self.harmonics
+        if len(numbers["noise_m2"]) != h.noise.size:
+            raise ModelError(f"{len(numbers['noise_m2'])} harmonics, not {h.noise.size}; learn the path anew")
+        self._last = np.array(document["last_correction_m"])
+        self.gain, self.held = document["gain"], document["held"]
+        self.returns, self.refused, self._offset = document["returns"], document["refused"], document["offset_m"]
+        if document["deviating"] is not None:
+            self._deviating = np.zeros(self.desired.size, dtype=np.bool_)
+            self._deviating[np.array(document["deviating"], dtype=np.intp)] = True
+        if best := document["best"]:
+            self.best = _Best(best["number"], best["power_m2"], np.array(best["correction_m"]))
+        self._hashes = list(document["hashes"])
+        self.passes = [PassReport(**one) for one in document["passes"]]
+        self.harmonics = replace(
+            h,
+            gain=_complex(numbers["gain"]),
+            gain_variance=np.array(numbers["gain_variance"]),
+            without=_complex(numbers["without_m"]),
+            without_variance=np.array(numbers["without_variance_m2"]) if numbers["passes"] else h.without_variance,
+            covariance=_complex(numbers["covariance_m"]),
+            noise=np.array(numbers["noise_m2"]),
+            passes=numbers["passes"],
+        )
+
+
+def _pairs(x: ComplexArray) -> list[list[float]]:
+    return [x.real.tolist(), x.imag.tolist()]
+
+
+def _complex(pairs: list[list[float]]) -> ComplexArray:
+    return np.array(pairs[0]) + 1j * np.array(pairs[1])

@@ -1,0 +1,204 @@
+"""A path that repeats: from what each pass measured, what to ask of the compensator in the next one."""
+
+import hashlib
+import json
+import os
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from slpi_ros.arrays import FloatArray
+from slpi_ros.errors import ModelError, UsageError
+from slpi_ros.io.atomic_file import all_or_nothing
+from slpi_ros.io.input_limits import MODEL_BYTES, read_input
+from slpi_ros.io.schemas import format_document, validate
+from slpi_ros.learning.axis_learner import AxisLearner, PassReport
+from slpi_ros.model.document import format_model
+from slpi_ros.model.stage_model import Signal, StageModel, check_time
+
+SCHEMA = "slpi_ros/learned/1"
+# Fewest samples of a pass, and largest deviation of a sampling interval from their mean.
+FEWEST, UNEVEN = 8, 0.2
+
+
+class Learner:
+    """Learns the correction of a path that repeats, pass by pass, harmonic by harmonic.
+
+    The correction is made to the desired path, before the inverse, so that what is learned is nearly linear. Each harmonic
+    has a complex gain that is learned, too, see `slpi_ros.learning.harmonics.Harmonics`; the rules that keep learning from
+    doing harm are in `slpi_ros.learning.axis_learner.AxisLearner`.
+
+    Parameters
+    ----------
+    model : StageModel
+        The model with which the path is compensated.
+    t : array_like, shape (N,), seconds
+        Evenly spaced times of one pass. A path that closes is taken to go on without a pause.
+    desired : array_like, shape (N,), or mapping of axis name to array_like, shape (N,), metres
+        The desired path.
+    axis : str, optional
+        The axis that an array without name is of; default: that of a model with one axis.
+    learn_limit : float, optional, metres
+        Most that learning may add to the desired path; default: a quarter of the identified stroke.
+    limits : (float, float), optional, volts
+        Voltage limits; default: the identified voltage range of each axis.
+
+    Raises
+    ------
+    UsageError
+        If an axis, a length or a value does not fit.
+    """
+
+    def __init__(
+        self,
+        model: StageModel,
+        t: ArrayLike,
+        desired: Signal,
+        *,
+        axis: str | None = None,
+        learn_limit: float | None = None,
+        limits: tuple[float, float] | None = None,
+    ) -> None:
+        self.model, self._named = model, isinstance(desired, Mapping)
+        self.t = check_time(t)
+        if self.t.size < FEWEST:
+            raise UsageError(f"a pass of {self.t.size} samples is too short; give at least {FEWEST}")
+        dt = float(self.t[-1] - self.t[0]) / (self.t.size - 1)
+        if not dt > 0.0 or float(np.abs(np.diff(self.t) - dt).max()) > UNEVEN * dt:
+            raise UsageError("the times of a pass are not evenly spaced; interpolate the path at even times")
+        if learn_limit is not None and not 0.0 < learn_limit < np.inf:
+            raise UsageError(f"learn_limit is {learn_limit}; give a positive number of metres")
+        self._default = axis or (next(iter(model.axes)) if len(model.axes) == 1 else "")
+        self.axes: dict[str, AxisLearner] = {}
+        for name, path in self._by_axis(desired, "desired").items():
+            if not np.isfinite(path).all():
+                raise UsageError(f"axis '{name}': the desired path holds values that are not finite; leave them out")
+            one = model.axis(name)
+            low, high = one.voltage_range
+            allowed = (low, high) if limits is None else (max(low, limits[0]), min(high, limits[1]))
+            self.axes[name] = AxisLearner(one, dt, path, learn_limit, allowed)
+
+    def path(self) -> Any:
+        """Return what to compensate in the next pass, metres, in the form of `desired`; at first the desired path."""
+        return self._in_form({name: axis.path for name, axis in self.axes.items()})
+
+    def update(self, measured: Signal, voltage: Signal | None = None) -> Any:
+        """Learn from the pass that has just ended, which followed `path`.
+
+        Parameters
+        ----------
+        measured : as `desired`, metres
+            Readings of the sensors at the times of the pass; NaN where there is none.
+        voltage : as `desired`, optional, volts
+            Voltage in the pass, if it is known: a pass that a limit held back is not learned from.
+
+        Returns
+        -------
+        PassReport, or dict of axis name to PassReport
+            In the form of `desired`.
+        """
+        seen = self._by_axis(measured, "measured")
+        applied = {} if voltage is None else self._by_axis(voltage, "voltage")
+        if missing := self.axes.keys() - seen.keys():
+            raise UsageError(f"no readings of axis '{min(missing)}'; give those of every axis of the path")
+        return self._in_form({name: axis.update(seen[name], applied.get(name)) for name, axis in self.axes.items()})
+
+    @property
+    def passes(self) -> dict[str, list[PassReport]]:
+        """Figures of all passes, by axis."""
+        return {name: list(axis.passes) for name, axis in self.axes.items()}
+
+    def forget(self) -> None:
+        """Begin anew from the desired path."""
+        for axis in self.axes.values():
+            axis.forget()
+
+    def to_document(self) -> dict[str, Any]:
+        """Return what was learned as a JSON document (schema ``learned``), with the identity of path and model."""
+        return {
+            "schema": SCHEMA,
+            "hardware_id": self.model.hardware_id,
+            "interval_s": float(self.t[-1] - self.t[0]) / (self.t.size - 1),
+            "path": path_identity(self.t, {name: axis.desired for name, axis in self.axes.items()}),
+            "axes": {name: {"model": self._identity(name)} | axis.to_document() for name, axis in self.axes.items()},
+        }
+
+    def resume(self, document: Mapping[str, Any], source: str = "learned") -> list[str]:
+        """Go on from a document of the same stage and path; return remarks.
+
+        Of another model, learning begins anew from the correction of the path. ModelError, which begins with `source`, if
+        the document is not valid, or of another stage or path.
+        """
+        validate(document, "learned", source)
+        if document["hardware_id"] != self.model.hardware_id:
+            raise ModelError(
+                f"{source}: learned on stage '{document['hardware_id']}', the model is of '{self.model.hardware_id}'; "
+                "learn the path of this stage anew"
+            )
+        own = path_identity(self.t, {name: axis.desired for name, axis in self.axes.items()})
+        if document["path"] != own or document["axes"].keys() != self.axes.keys():
+            raise ModelError(f"{source}: learned for another path; give the file of this path, or learn it anew")
+        remarks = []
+        for name, axis in self.axes.items():
+            learned = document["axes"][name]
+            same = learned["model"] == self._identity(name)
+            try:
+                axis.resume(learned, same_model=same)
+            except (ModelError, IndexError, KeyError, TypeError, ValueError) as error:
+                raise ModelError(f"{source}: axis '{name}': {error}") from None
+            if not same:
+                remarks.append(f"axis '{name}': another model; learned anew, from the correction of the path so far")
+        return remarks
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the document of what was learned to a file, atomically; ModelError if it cannot be written."""
+        text = format_document(self.to_document(), "learned")
+        with all_or_nothing(path, ModelError) as file:
+            file.write(text)
+
+    def load(self, path: str | os.PathLike[str]) -> list[str]:
+        """Go on from a file that `save` wrote; return remarks. ModelError as `resume`, or if it cannot be read."""
+        try:
+            document = json.loads(read_input(path, MODEL_BYTES).decode())
+        except (OSError, ValueError, RecursionError) as error:
+            reason = error.strerror if isinstance(error, OSError) else "it is no JSON document"
+            raise ModelError(f"{path}: cannot read what was learned: {reason}; leave it out to learn anew") from None
+        return self.resume(document, str(path))
+
+    def _identity(self, axis: str) -> str:
+        return hashlib.sha256(format_model(StageModel({axis: self.model.axes[axis]})).encode()).hexdigest()
+
+    def _by_axis(self, signal: Signal, what: str) -> dict[str, FloatArray]:
+        if not isinstance(signal, Mapping):
+            if not self._default:
+                raise UsageError(
+                    f"the model holds axes {', '.join(self.model.axes)}; give {what} as a mapping of axis name to array, "
+                    "or name the axis"
+                )
+            signal = {self._default: signal}
+        found: dict[str, FloatArray] = {}
+        for name, values in signal.items():
+            self.model.axis(name)
+            try:
+                found[name] = np.array(values, dtype=np.float64)
+            except (TypeError, ValueError) as error:
+                raise UsageError(f"axis '{name}': {what} is not an array of numbers: {error}") from None
+            if found[name].shape != self.t.shape:
+                raise UsageError(
+                    f"axis '{name}': {what} has shape {found[name].shape}, the pass has {self.t.shape}; give one value "
+                    "for each time"
+                )
+        return found
+
+    def _in_form(self, by_axis: dict[str, Any]) -> Any:
+        return by_axis if self._named else next(iter(by_axis.values()))
+
+
+def path_identity(t: FloatArray, desired: Mapping[str, FloatArray]) -> str:
+    """Return a hash of a path, (N,), s and m by axis, whatever its stamp: times to 1 us, displacements to 1 pm."""
+    digest = hashlib.sha256(np.round(1e6 * (t - t[0])).astype(np.int64).tobytes())
+    for name in sorted(desired):
+        digest.update(name.encode() + np.round(1e12 * desired[name]).astype(np.int64).tobytes())
+    return digest.hexdigest()

@@ -3,7 +3,8 @@
     make bench-export                                            # 1e6 steps of 200 models, a few minutes
     .venv/bin/python benchmarks/export.py --steps 10000000       # 1e7 steps
 
-Times are ratios of one run. The worst case is a number of instructions, counted by callgrind (valgrind).
+Times are those of the processor, as ratios of one run. The worst case is a number of instructions, counted by
+callgrind (valgrind).
 """
 
 import argparse
@@ -166,9 +167,9 @@ class Compiled:
         at = [each.ctypes.data_as(ctypes.c_void_p) for each in (dt, y, v, code)]
         for _ in range(3):
             self.library.slpi_inverse_init(self.state, None)
-            started = time.perf_counter()
+            started = time.process_time()
             self.library.slpi_run(self.state, dt.size, *at)
-            times.append((time.perf_counter() - started) / dt.size)
+            times.append((time.process_time() - started) / dt.size)
         return v.astype(np.float64), code, min(times)
 
 
@@ -176,14 +177,14 @@ def streamed(stage, t, y):
     """Return what the stream of Python answers, and its time (s) of a step."""
     stream, names = stage.stream(), [axis.name for axis in stage.axes]
     v, codes = np.empty(y.shape), np.zeros(t.size, np.int32)
-    started = time.perf_counter()
+    started = time.process_time()
     for k, (now, desired) in enumerate(zip(t.tolist(), y.tolist(), strict=True)):
         try:
             stream.step(now, dict(zip(names, desired, strict=True)))
         except SlpiError as error:
             codes[k] = code_of(error)
         v[k] = [stream.streams[name].voltage for name in names]
-    return v, codes, (time.perf_counter() - started) / t.size
+    return v, codes, (time.process_time() - started) / t.size
 
 
 def smooth(stage, steps):

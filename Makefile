@@ -218,8 +218,8 @@ bench-fleet: build
 
 # Tools of 1 GB, so that neither `make test` nor anybody else needs them.
 test-export-arm: build
-	@command -v arm-none-eabi-gcc qemu-system-arm >/dev/null || { apt-get update && apt-get install -y \
-		--no-install-recommends gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm; }
+	@command -v arm-none-eabi-gcc >/dev/null && command -v qemu-system-arm >/dev/null || { apt-get update && apt-get \
+		install -y --no-install-recommends gcc-arm-none-eabi libnewlib-arm-none-eabi qemu-system-arm; }
 	PYTHONPATH=.:test $(VENV) test/export/run_arm.py
 
 bench-export: build

@@ -3,7 +3,8 @@
     make bench-export                                            # 1e6 steps of 200 models, a few minutes
     .venv/bin/python benchmarks/export.py --steps 10000000       # 1e7 steps
 
-Times are ratios of one run. The worst case is a number of instructions, counted by callgrind where valgrind is installed.
+Times are those of the processor, as ratios of one run. The worst case is a number of instructions, counted by
+callgrind (valgrind).
 """
 
 import argparse
@@ -166,9 +167,9 @@ class Compiled:
         at = [each.ctypes.data_as(ctypes.c_void_p) for each in (dt, y, v, code)]
         for _ in range(3):
             self.library.slpi_inverse_init(self.state, None)
-            started = time.perf_counter()
+            started = time.process_time()
             self.library.slpi_run(self.state, dt.size, *at)
-            times.append((time.perf_counter() - started) / dt.size)
+            times.append((time.process_time() - started) / dt.size)
         return v.astype(np.float64), code, min(times)
 
 
@@ -176,14 +177,14 @@ def streamed(stage, t, y):
     """Return what the stream of Python answers, and its time (s) of a step."""
     stream, names = stage.stream(), [axis.name for axis in stage.axes]
     v, codes = np.empty(y.shape), np.zeros(t.size, np.int32)
-    started = time.perf_counter()
+    started = time.process_time()
     for k, (now, desired) in enumerate(zip(t.tolist(), y.tolist(), strict=True)):
         try:
             stream.step(now, dict(zip(names, desired, strict=True)))
         except SlpiError as error:
             codes[k] = code_of(error)
         v[k] = [stream.streams[name].voltage for name in names]
-    return v, codes, (time.perf_counter() - started) / t.size
+    return v, codes, (time.process_time() - started) / t.size
 
 
 def smooth(stage, steps):
@@ -231,9 +232,8 @@ def agreement(models, steps, folder, rng):
     print(f"  {sum(error == 0.0 for error in errors)} of {models} models to the last bit; allowed 1e-12")
     for group, found in floats.items():
         if found:
-            print(
-                f"float on smooth paths, {group}: median {np.median(found):.2g}, largest {max(found):.2g} ({len(found)} models)"
-            )
+            spread = f"median {np.median(found):.2g}, largest {max(found):.2g}"
+            print(f"float on smooth paths, {group}: {spread} ({len(found)} models)")
     print(f"state of an axis, 64 turning points: median {np.median(sizes):.0f}, largest {max(sizes):.0f} bytes")
 
 
@@ -268,9 +268,8 @@ def beyond(folder, rng):
         own = folder / f"turns{held}"
         own.mkdir()
         answers, _, _ = Compiled(own, one, f"-DSLPI_TURNS={held}").run(dt, y)
-        print(
-            f"{turns} nested turns, {held} kept: largest error {largest(one, answers, expected, codes):.2g} of the range"
-        )
+        error = largest(one, answers, expected, codes)
+        print(f"{turns} nested turns, {held} kept: largest error {error:.2g} of the range")
 
 
 def worst(folder, rng):
@@ -299,9 +298,7 @@ def worst(folder, rng):
         done = subprocess.run(command, cwd=own, capture_output=True, text=True, check=True)
         counted = re.findall(r"Collected : (\d+)", done.stderr)[-1]
         code, before, after = done.stdout.split()
-        print(
-            f"worst step, {label}: {counted} instructions; {before} turning points before it, {after} after, code {code}"
-        )
+        print(f"worst step, {label}: {counted} instructions; turning points {before} to {after}, code {code}")
 
 
 def main():

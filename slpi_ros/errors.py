@@ -13,6 +13,7 @@ HOW_TO_GET = {
     "bokeh": _FLEET,
     "dask": _FLEET,
     "distributed": _FLEET,
+    "jinja2": "apt install python3-jinja2, or pip install jinja2",
     "jsonschema": "apt install python3-jsonschema, or pip install jsonschema",
     "matplotlib": "apt install python3-matplotlib, or pip install matplotlib",
     "numba": "apt install python3-numba, or pip install numba",

@@ -138,7 +138,7 @@ def test_a_python_is_found_where_it_is_not_the_one_in_use(tmp_path):
 @pytest.mark.parametrize("ci", ["", "true"])
 def test_ci_says_loudly_that_there_is_no_python_of_ubuntu(tmp_path, ci):
     python_in(tmp_path, "3.11")
-    for name in ("chromium", "make", "python3.12"):
+    for name in ("chromium", "clang", "cppcheck", "g++", "make", "python3.12"):
         (tmp_path / name).write_text(f'#!/bin/sh\n[ {name} != python3.12 ] || exit 127\necho {name} "$@"\n')
         (tmp_path / name).chmod(0o755)
     environment = {"PATH": f"{tmp_path}:/usr/bin:/bin", "PYENV_ROOT": str(tmp_path), "HOME": str(tmp_path), "CI": ci}

@@ -1,18 +1,20 @@
 """What an export can be written as: its files, and whether they may be written into a folder."""
 
+import os
 import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from slpi_ros.errors import UsageError
+from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.export.c_source import c_files
+from slpi_ros.export.fmu import MARK, NAMES, fmu_files
 from slpi_ros.export.stage import ExportedStage
 from slpi_ros.export.vectors import program_files
 from slpi_ros.io.atomic_file import all_or_nothing, is_replaceable, output_folder
 
-# By this line slpi knows its own files.
-MARK = b"Written by `slpi export`"
+# Bytes at both ends of a file, in which slpi finds its mark if it wrote the file.
+ENDS = 2000
 
 
 @dataclass(frozen=True)
@@ -20,7 +22,7 @@ class Target:
     """One kind of export: the names of its files, what is in them, and the command that follows."""
 
     names: tuple[str, ...]
-    files: Callable[[ExportedStage], Mapping[str, str]]
+    files: Callable[[ExportedStage], Mapping[str, str] | Mapping[str, bytes]]
     _next: str  # with the folder as ``{}``
 
     def allow(self, folder: str, *, overwrite: bool) -> list[str]:
@@ -34,9 +36,12 @@ class Target:
         """Write the files; return their names."""
         made = self.files(stage)
         with output_folder(folder, *made) as place:
-            for name, text in made.items():
-                with all_or_nothing(place / name) as file:
-                    file.write(text)
+            for name, content in made.items():
+                if isinstance(content, bytes):
+                    _write_bytes(place / name, content)
+                else:
+                    with all_or_nothing(place / name) as file:
+                        file.write(content)
         return list(made)
 
     def next(self, folder: str) -> str:
@@ -49,9 +54,22 @@ def _own(path: Path) -> bool:
     if not is_replaceable(path) or path.is_dir():
         return False
     try:
-        return not path.exists() or not path.stat().st_size or MARK in path.read_bytes()[:2000]
+        content = path.read_bytes() if path.exists() else b""
+        return not content or MARK in content[:ENDS] + content[-ENDS:]
     except OSError:
         return False
+
+
+def _write_bytes(path: Path, content: bytes) -> None:
+    """Replace a file at once."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        draft.write_bytes(content)
+        os.replace(draft, path)
+    except OSError as error:
+        raise SlpiError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
+    finally:
+        draft.unlink(missing_ok=True)
 
 
 def _c(stage: ExportedStage) -> Mapping[str, str]:
@@ -64,4 +82,5 @@ TARGETS: Mapping[str, Target] = {
         _c,
         "cd {} && cc -std=c11 -O2 slpi_inverse.c slpi_test.c -lm -o slpi_test && ./slpi_test",
     ),
+    "fmu": Target(NAMES, fmu_files, "fmpy validate {}/slpi_inverse_fmi3.fmu"),
 }

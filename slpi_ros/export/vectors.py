@@ -19,9 +19,9 @@ OK, BAD_TIME, NOT_FINITE, OUT_OF_RANGE, UNREACHABLE = range(5)
 STEPS, USUAL = 1200, 1e-4
 # Stored displacements of each mode, and how many more a step needs.
 HISTORY = 128
-# Largest difference to the stream of Python, as a share of the voltage range: double; float; float with states that hardly
-# change in a step, or with the logarithm of a small step. The inverse of a mode multiplies what rounding leaves, that of a
-# lag by its time constant over the step.
+# Largest difference to the stream of Python, as a share of the voltage range: double; float; float with states that
+# hardly change in a step, or with the logarithm of a small step. The inverse of a mode multiplies what rounding leaves,
+# that of a lag by its time constant over the step.
 DOUBLE, FLOAT, FLOAT_SLOW, RINGING = 1e-12, 1e-5, 1e-4, 10.0
 
 

@@ -64,9 +64,8 @@ def tried(folder, label, board, machine, number):
         )
         answers.append(said(folder, *run, "-kernel", "program.elf").strip())
     kind = "float " if number else "double"
-    print(
-        f"{name:10} {kind} {label:16} code and tables {int(text):6} B, data {int(data) + int(bss)} B; {answers[0]}; {answers[1]}"
-    )
+    sizes = f"code and tables {int(text):6} B, data {int(data) + int(bss)} B"
+    print(f"{name:10} {kind} {label:16} {sizes}; {answers[0]}; {answers[1]}")
 
 
 def main():

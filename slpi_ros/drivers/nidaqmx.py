@@ -180,7 +180,7 @@ class NidaqmxDevice(Device):
         output, count = self._tasks["output"], len(self._block.voltages)
         with self._told("playing a block"):
             if output.is_task_done():
-                self._take()
+                self._take_all()
                 self._end()
                 return count
             return min(int(output.out_stream.total_samp_per_chan_generated), count - 1)
@@ -188,12 +188,11 @@ class NidaqmxDevice(Device):
     def halt(self) -> int:
         """Stop the sample clock; the outputs stay."""
         with self._told("stopping a block"):
-            output = self._tasks["output"]
-            played = int(output.out_stream.total_samp_per_chan_generated)
-            output.stop()
-            self._take()
+            self._tasks["output"].stop()
+            self._take_all()
             self._end()
-        return played
+        # The inputs sample with the clock of the outputs, so that they count its samples.
+        return sum(piece.shape[1] for piece in self._pieces)
 
     def recorded(self) -> Generator[None, None, Recording | None]:
         """Return what the inputs sampled meanwhile."""
@@ -227,6 +226,10 @@ class NidaqmxDevice(Device):
         self._require_volts(values)
         self._pieces.append(values)
         return values
+
+    def _take_all(self) -> None:
+        while len(self._take()):
+            pass
 
     def _end(self) -> None:
         """Read on demand again."""

@@ -5,6 +5,7 @@ device is never reset, which would set its outputs to 0 V.
 """
 
 import collections
+import os
 import re
 import time
 from collections.abc import Generator, Iterator, Sequence
@@ -344,6 +345,8 @@ def _first_line(error: Exception) -> str:
 
 def _link_to(name: str, host: str, port: int) -> Any:
     """Return a channel to a gRPC server, on which no call waits longer than `TIMEOUT`."""
+    # It writes what it does to standard error; the errors say what matters.
+    os.environ.setdefault("GRPC_VERBOSITY", "NONE")
     with dependencies_needed():
         import grpc
 

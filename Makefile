@@ -59,7 +59,7 @@ help:
 	@echo 'make bench-next-record   an advised second record, and pairs judged on a third; an hour or two'
 	@echo 'make bench-start-memory  100 memories at the start of a record: is a change told where there is one only'
 	@echo 'make bench-latency  round trip through the compensator beside a bare echo node, 4 minutes'
-	@echo 'make bench-driver    cycles of the driver with a simulated controller: rate, lateness, processor, half a minute'
+	@echo 'make bench-driver    cycles of the driver with simulated devices: rate, lateness, processor, a minute'
 	@echo 'make bench-platforms  RECORD=table.csv: the ten commands with the versions of Ubuntu 24.04: the same figures?'
 	@echo 'make bench-restarts   a compensator that is killed and started again: time to its first answer, 10 minutes'
 	@echo 'make bench-soak     10 minutes at 1 kHz, 1 minute at 5 kHz, and the ceiling'

@@ -8,7 +8,11 @@ NAME = "slpi_ros"
 SHARE = f"share/{NAME}"
 FLEET = ["bokeh>=3.1.0", "dask[distributed]>=2024.1.0", "pandas>=2.1.4", "pyarrow>=14.0.1"]
 # Of devices, one extra each; PI's GCS over TCP needs none.
-DRIVERS = {"labjack": ["pymodbus>=3.16.1"], "serial": ["pyserial>=3.5", "pyyaml>=6.0.1"]}
+DRIVERS = {
+    "labjack": ["pymodbus>=3.16.1"],
+    "nidaqmx": ["nidaqmx[grpc]>=1.7.0"],
+    "serial": ["pyserial>=3.5", "pyyaml>=6.0.1"],
+}
 
 setup(
     name=NAME,

@@ -2,15 +2,16 @@
 
 ros2 launch slpi_ros calibrate.launch.py params_file:=calibrator.yaml output:=my_stage
 ros2 launch slpi_ros calibrate.launch.py params_file:=calibrator.yaml output:=demo simulate:=true
+ros2 launch slpi_ros calibrate.launch.py params_file:=calibrator.yaml output:=my_stage driver_file:=driver.yaml
 
 The launch ends with the calibrator, whose exit code is 0 if the target is met, else 1.
 """
 
 from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandler
-from launch.conditions import IfCondition
+from launch.conditions import IfCondition, UnlessCondition
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
-from launch.substitutions import LaunchConfiguration
+from launch.substitutions import EqualsSubstitution, LaunchConfiguration
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
 
@@ -22,6 +23,9 @@ TOPICS = {
     "state_topic": ("stage_state", "topic of the stage state"),
     "model_topic": ("stage_model", "topic of the stage model"),
     "diagnostics_topic": ("/diagnostics", "topic of the diagnostics"),
+    "voltage_trajectory_topic": ("voltage_trajectory", "topic of whole paths for the driver"),
+    "trajectory_state_topic": ("voltage_trajectory_state", "topic of what becomes of them"),
+    "recorded_topic": ("recorded_trajectory", "topic of what the device recorded of them"),
 }
 
 
@@ -38,6 +42,16 @@ def generate_launch_description() -> LaunchDescription:
         ],
         remappings=topics,
         condition=IfCondition(LaunchConfiguration("simulate")),
+        output="screen",
+    )
+    driver = Node(
+        package="slpi_ros",
+        executable="driver",
+        name="driver",
+        namespace=namespace,
+        parameters=[LaunchConfiguration("driver_file")],
+        remappings=topics,
+        condition=UnlessCondition(EqualsSubstitution(LaunchConfiguration("driver_file"), "")),
         output="screen",
     )
     calibrator = Node(
@@ -71,7 +85,11 @@ def generate_launch_description() -> LaunchDescription:
             "simulate", default_value="false", description="start a simulated stage with hidden effects"
         ),
         DeclareLaunchArgument("simulated_seed", default_value="1", description="seed of the simulated stage"),
+        DeclareLaunchArgument(
+            "driver_file", default_value="", description="parameters of the node driver; empty: no driver is started"
+        ),
         simulator,
+        driver,
         calibrator,
         RegisterEventHandler(OnProcessExit(target_action=calibrator, on_exit=[EmitEvent(event=Shutdown())])),
     ])  # fmt: skip

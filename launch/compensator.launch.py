@@ -1,9 +1,12 @@
-"""Start one compensator: ros2 launch slpi_ros compensator.launch.py params_file:=... model_file:=..."""
+"""Start one compensator: ros2 launch slpi_ros compensator.launch.py params_file:=... model_file:=...
+
+With driver_file:=driver.yaml the driver of the amplifier is started, too.
+"""
 
 from launch.actions import DeclareLaunchArgument
 from launch.conditions import IfCondition, UnlessCondition
 from launch.substitutions import EqualsSubstitution, LaunchConfiguration, PathJoinSubstitution
-from launch_ros.actions import LifecycleNode
+from launch_ros.actions import LifecycleNode, Node
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
@@ -21,7 +24,15 @@ TOPICS = {
     "error_topic": ("tracking_error", "topic of the tracking errors"),
     "model_topic": ("stage_model", "topic of the stage model"),
     "diagnostics_topic": ("/diagnostics", "topic of the diagnostics"),
+    "voltage_trajectory_topic": ("voltage_trajectory", "topic of whole paths, with trajectory_output: block"),
+    "trajectory_state_topic": ("voltage_trajectory_state", "topic of what becomes of them"),
+    "recorded_topic": ("recorded_trajectory", "topic of what the device recorded of them"),
 }
+# Those of the driver.
+DRIVER_TOPICS = (
+    "voltage_topic", "state_topic", "diagnostics_topic", "voltage_trajectory_topic", "trajectory_state_topic",
+    "recorded_topic",
+)  # fmt: skip
 
 
 def generate_launch_description() -> LaunchDescription:
@@ -32,13 +43,26 @@ def generate_launch_description() -> LaunchDescription:
     return LaunchDescription([
         DeclareLaunchArgument("params_file", default_value=ONE_AXIS, description="parameters of the compensator"),
         DeclareLaunchArgument("model_file", default_value="", description="model document, if not in params_file"),
-        DeclareLaunchArgument("namespace", default_value="", description="namespace of the node and its topics"),
+        DeclareLaunchArgument(
+            "driver_file", default_value="", description="parameters of the node driver; empty: no driver is started"
+        ),
+        DeclareLaunchArgument("namespace", default_value="", description="namespace of the nodes and their topics"),
         *(
             DeclareLaunchArgument(argument, default_value=topic, description=meaning)
             for argument, (topic, meaning) in TOPICS.items()
         ),
         compensator(as_in_params_file, IfCondition(no_model_file)),
         compensator(with_model_file, UnlessCondition(no_model_file)),
+        Node(
+            package="slpi_ros",
+            executable="driver",
+            name="driver",
+            namespace=LaunchConfiguration("namespace"),
+            parameters=[LaunchConfiguration("driver_file")],
+            remappings=[(TOPICS[argument][0], LaunchConfiguration(argument)) for argument in DRIVER_TOPICS],
+            output="screen",
+            condition=UnlessCondition(EqualsSubstitution(LaunchConfiguration("driver_file"), "")),
+        ),
     ])  # fmt: skip
 
 

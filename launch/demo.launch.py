@@ -25,6 +25,8 @@ TOPICS = {
     "state_topic": ("stage_state", "topic of the stage state"),
     "model_topic": ("stage_model", "topic of the stage model"),
     "diagnostics_topic": ("/diagnostics", "topic of the diagnostics"),
+    "voltage_trajectory_topic": ("voltage_trajectory", "topic of whole paths, with trajectory_output: block"),
+    "trajectory_state_topic": ("voltage_trajectory_state", "topic of what becomes of them"),
 }
 
 

@@ -16,6 +16,7 @@ HOW_TO_GET = {
     "jinja2": "apt install python3-jinja2, or pip install jinja2",
     "jsonschema": "apt install python3-jsonschema, or pip install jsonschema",
     "matplotlib": "apt install python3-matplotlib, or pip install matplotlib",
+    "nidaqmx": "pip install 'slpi_ros[nidaqmx]', or pip install 'nidaqmx[grpc]'",
     "numba": "apt install python3-numba, or pip install numba",
     "numpy": "apt install python3-numpy, or pip install numpy",
     "osqp": "pip install osqp",

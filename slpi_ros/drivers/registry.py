@@ -10,10 +10,11 @@ from slpi_ros.errors import UsageError, dependencies_needed
 MODULES = {
     "gcs": "slpi_ros.drivers.gcs",
     "labjack": "slpi_ros.drivers.labjack",
+    "nidaqmx": "slpi_ros.drivers.nidaqmx",
     "serial": "slpi_ros.drivers.serial",
 }
 # What the first axis is called, by kind or dialect, where nobody says a name.
-FIRST_CHANNEL = {"gcs": "1", "labjack": "DAC0:AIN0", "nv200": "1", "mdt69xb": "x"}
+FIRST_CHANNEL = {"gcs": "1", "labjack": "DAC0:AIN0", "nidaqmx": "ao0:ai0", "nv200": "1", "mdt69xb": "x"}
 
 
 def make_device(kind: str, address: str, channels: Sequence[Channel]) -> Device:

@@ -51,9 +51,9 @@ class Stream(ABC):
         except OSError as error:
             raise self._lost(error) from error
 
-    def until(self, length: Callable[[bytes], int], what: str, seconds: float = TIMEOUT) -> bytes:
+    def until(self, length: Callable[[bytes], int], what: str) -> bytes:
         """Return the next answer: as many bytes as `length` says of all that came, once it says more than none."""
-        deadline = time.monotonic() + seconds
+        deadline = time.monotonic() + TIMEOUT
         while not (count := length(self._buffer)):
             left = deadline - time.monotonic()
             if left < 0.0:

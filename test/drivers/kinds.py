@@ -10,6 +10,7 @@ from slpi_ros.drivers.base import Channel
 from slpi_ros.drivers.registry import make_device
 from slpi_ros.simulation.devices.gcs import GcsSimulator
 from slpi_ros.simulation.devices.labjack import LabjackSimulator
+from slpi_ros.simulation.devices.nidaqmx import NidaqmxSimulator
 from slpi_ros.simulation.devices.serial import MdtSimulator, Nv200Simulator
 
 
@@ -52,6 +53,7 @@ KINDS = {
     "tick": Kind(
         "labjack", LabjackSimulator, ("TDAC0:AIN0:AIN2", "TDAC1:AIN1:AIN3"), gain=20.0, scale=1e-5, rounding=2e-5
     ),
+    "nidaqmx": Kind("nidaqmx", NidaqmxSimulator, ("ao0:ai0", "ao1:ai1"), gain=10.0, scale=1e-5),
     "gcs at a serial port": Kind("gcs", GcsSimulator, ("1", "2"), terminal=True),
     "nv200": Kind("serial", Nv200Simulator, ("1",), rounding=6e-4, address="nv200:{}", terminal=True),
     "mdt": Kind("serial", MdtSimulator, ("x", "y"), rounding=0.051, address="mdt69xb:{}", terminal=True, sensor=False),

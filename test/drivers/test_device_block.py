@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from drivers.kinds import KINDS
 
+from slpi_ros.drivers import labjack, nidaqmx, stream
 from slpi_ros.model.limits import Limits
 from slpi_ros.nodes.device_block import BlockRequest, Told
 from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings, State
@@ -36,13 +37,17 @@ class Bench:
         for _ in range(times):
             if self._now_ns is not None:
                 self._now_ns += int(1e9 / RATE)
+            else:
+                # The simulated device is in this process.
+                time.sleep(1e-3)
             self.loop.turn()
 
-    def until(self, done, most=20_000):
+    def until(self, done, most=20_000, lost=False):
         for _ in range(most):
             if done():
                 return
             self.turn()
+            assert lost or self.loop.status.state is not State.LOST, self.loop.status.reason
         raise AssertionError(f"in vain; {self.loop.status}, {self.told}")
 
     @property
@@ -65,7 +70,10 @@ class Bench:
 
 
 @pytest.fixture
-def bench(request):
+def bench(request, monkeypatch):
+    # The simulated device is in this process, and on a busy machine it may be late.
+    for module in (stream, labjack, nidaqmx):
+        monkeypatch.setattr(module, "TIMEOUT", 2.0)
     name, axes, voltages, real, *rest = request.param
     kind = KINDS[name]
     with kind.simulate(axes, voltages, **(rest[0] if rest else {})) as simulator:
@@ -80,7 +88,7 @@ def wave(count, period, *begin, frequency=5.0, size=10.0):
     return np.stack([v + size * (1.0 - np.cos(2 * np.pi * frequency * t)) for v in begin], 1)
 
 
-@pytest.mark.parametrize("bench", [("gcs", 2, [20.0, 30.0], True)], indirect=True)
+@pytest.mark.parametrize("bench", [("gcs", 2, [20.0, 30.0], True), ("nidaqmx", 2, [20.0, 30.0], True)], indirect=True)
 @pytest.mark.parametrize("count", [4000, pytest.param(20_000, marks=pytest.mark.long)])
 def test_a_device_plays_a_block_by_its_clock_bit_for_bit(bench, count):
     period = 5e-5
@@ -92,7 +100,7 @@ def test_a_device_plays_a_block_by_its_clock_bit_for_bit(bench, count):
     for place, axis in enumerate(bench.simulator.axes):
         played = [each for each in bench.simulator.log if each.axis == axis]
         changed = np.flatnonzero(np.diff(v[:, place])) + 1
-        np.testing.assert_array_equal([each.voltage for each in played], v[changed, place])
+        np.testing.assert_array_equal([each.voltage for each in played], v[changed, place] * (1.0 / bench.kind.gain))
         times = np.array([each.time_ns for each in played])
         np.testing.assert_array_equal(times - times[0], (changed - changed[0]) * 50_000)
     recording = bench.loop.recorded[0].recording
@@ -100,7 +108,7 @@ def test_a_device_plays_a_block_by_its_clock_bit_for_bit(bench, count):
     np.testing.assert_allclose(recording.voltages, v, atol=1e-8)
     # The positions are those of the simulated stage, and the states went on meanwhile.
     assert np.ptp(recording.positions[:, 0]) > 1e-7 and np.corrcoef(recording.positions[:, 0], v[:, 0])[0, 1] > 0.9
-    assert len(bench.readings) > 10
+    assert len(bench.readings) > 2
     # Afterwards single voltages go on from its end.
     assert bench.loop.command(v[-1].tolist()) == ""
     bench.turn(5)
@@ -153,17 +161,20 @@ def test_times_that_do_not_increase(bench):
     assert bench.told == [Told.REFUSED]
 
 
-@pytest.mark.parametrize("bench", [("gcs", 2, [20.0, 30.0], True), ("labjack", 2, [20.0, 30.0], True)], indirect=True)
+@pytest.mark.parametrize(
+    "bench", [(name, 2, [20.0, 30.0], True) for name in ("gcs", "labjack", "nidaqmx")], indirect=True
+)
 @pytest.mark.parametrize("how", ["stop", "empty"])
 def test_stopped_it_holds_where_it_is(bench, how):
-    count, period = 20_000, 5e-5
+    # Long enough that it does not end by itself meanwhile.
+    count, period = 40_000, 5e-4
     v = wave(count, period, 20.0, 30.0)
     bench.submit(v, period)
     bench.until(lambda: bench.simulator.log)
     assert "block" in bench.loop.command([20.0, 30.0])
     bench.submit(v, period, stamp=8)
-    bench.until(lambda: bench.states[-1].stamp_ns == 8)
-    assert bench.told[-1] is Told.REFUSED
+    bench.until(lambda: [state for state in bench.states if state.stamp_ns == 8])
+    assert [state.told for state in bench.states if state.stamp_ns == 8] == [Told.REFUSED]
     if how == "stop":
         bench.loop.request("stop")
     else:
@@ -185,21 +196,21 @@ def test_stopped_it_holds_where_it_is(bench, how):
     assert bench.largest_step <= SLEW * 2.0 / RATE
 
 
-@pytest.mark.parametrize("bench", [("gcs", 1, [20.0], True), ("labjack", 1, [20.0], True)], indirect=True)
+@pytest.mark.parametrize("bench", [(name, 1, [20.0], True) for name in ("gcs", "labjack", "nidaqmx")], indirect=True)
 @pytest.mark.parametrize("kind", [SILENT, LOST])
 def test_a_link_that_is_lost_ends_the_block_here(bench, kind):
     v = wave(10_000, 5e-5, 20.0)
     bench.submit(v, 5e-5)
     bench.until(lambda: bench.simulator.log)
     bench.simulator.fault = Fault(kind, seconds=0.0)
-    bench.until(lambda: bench.loop.status.state is State.LOST)
+    bench.until(lambda: bench.loop.status.state is State.LOST, lost=True)
     assert bench.told[-1] is Told.STOPPED and bench.states[-1].reason == bench.loop.status.reason
     # A device that plays on by itself is not taken over before its end.
-    bench.until(lambda: bench.loop.status.state is State.HELD, most=10**7)
+    bench.until(lambda: bench.loop.status.state is State.HELD, most=10**7, lost=True)
     there = bench.kind.volts(bench.simulator)
     bench.turn(5)
     assert bench.kind.volts(bench.simulator) == there
-    if bench.loop._device.block_period:
+    if bench.kind.device == "gcs":
         assert there == v[-1].tolist()
     assert bench.largest_step <= SLEW * 2.0 / RATE
 

@@ -49,7 +49,7 @@ class Bench:
 
         def there():
             self.commands.publish(Float64MultiArray(data=list(voltages)))
-            return list(self.states[-1].effort) == list(voltages)
+            return list(self.states[-1].effort) == pytest.approx(list(voltages), abs=1e-4)
 
         self.graph.spin_until(there, f"{voltages} V")
 
@@ -130,22 +130,37 @@ def test_its_end_and_the_next_start(end, parameters, voltage):
         assert largest_step(simulator, 20.0) <= LARGEST_STEP
 
 
-def test_a_simulated_device_as_a_node():
+# Of each simulated device: where it is served, where the driver finds it, its first channel, V/V of the amplifier.
+SIMULATED = {
+    "gcs": ("127.0.0.1:{port}", "127.0.0.1:{port}", "1", 1.0),
+    "labjack": ("127.0.0.1:{port}", "127.0.0.1:{port}", "DAC0:AIN0", 20.0),
+    "nidaqmx": ("127.0.0.1:{port}", "Dev1@127.0.0.1:{port}", "ao0:ai0", 10.0),
+    "nv200": ("{folder}/tty", "nv200:{folder}/tty", "1", 1.0),
+}
+
+
+@pytest.mark.parametrize("name", ["gcs", *(pytest.param(name, marks=pytest.mark.long) for name in list(SIMULATED)[1:])])
+def test_a_simulated_device_as_a_node(tmp_path, name):
     with socket.create_server(("127.0.0.1", 0)) as server:
-        address = "{}:{}".format(*server.getsockname())
-    with started("device_simulator", {"address": address, "voltage": 15.0, "noise_rms": 0.0}) as device:
+        port = server.getsockname()[1]
+    served, found, channel, gain = SIMULATED[name]
+    place = served.format(port=port, folder=tmp_path)
+    given = {"device": name, "address": place, "voltage": 15.0 / gain, "noise_rms": 0.0}
+    with started("device_simulator", given) as device:
         # Until it listens, a driver would end.
         while "own range" not in device.stderr:
             assert device.process.poll() is None
-        with driver(address, rearm=True) as bench:
+        kind = "serial" if name == "nv200" else name
+        own = {"device": kind, "channels": [channel], "amplifier_gain": gain, "voltage_max": 90.0, "rate": 100.0}
+        with driver(found.format(port=port, folder=tmp_path), rearm=True, **own) as bench:
             bench.connect()
-            assert list(bench.states[0].effort) == [15.0]
+            assert list(bench.states[0].effort) == pytest.approx([15.0], abs=1e-4)
             bench.reach(25.0)
             assert bench.graph.set_parameters("/device_simulator", fault="half") == ""
             lost = bench.graph.wait_for_status(
                 "/driver: driver", lambda status: values_of(status)["links_lost"] == "1", "the loss"
             )
-            assert "gcs" in values_of(lost)["device"]
+            assert kind in values_of(lost)["device"]
             bench.reach(35.0)
 
 

@@ -12,6 +12,7 @@ from slpi_ros.simulation.stage import Stage
 SIMULATORS = {
     "gcs": "gcs.GcsSimulator",
     "labjack": "labjack.LabjackSimulator",
+    "nidaqmx": "nidaqmx.NidaqmxSimulator",
     "nv200": "serial.Nv200Simulator",
     "mdt69xb": "serial.MdtSimulator",
 }

@@ -67,6 +67,7 @@ def test_the_voltage_follows_and_diagnostics_say_what_is_wrong(model_file):
         assert client.ask(["x"], [5e-6]) == pytest.approx([warm], abs=1e-6)
 
 
+@pytest.mark.long
 def test_another_topic_and_type_by_the_parameter(model_file):
     with compensator(model_file=model_file, surroundings=["/lab/number", "/load:force.z"]) as client:
         client.connect()
@@ -81,6 +82,7 @@ def test_where_quantities_are_found():
     assert assigned(keys, ("/a", "/c:force.x")) == {"/a": ("/a", ""), "/b:force.z": ("/c", "force.x")}
 
 
+@pytest.mark.long
 def test_the_simulator_publishes_its_room():
     parameters = {"room_swing": 1.0, "room_rate": 20.0, "temperature_offset": 1e-7, "seed": 5}
     with on_graph() as graph:

@@ -97,7 +97,9 @@ DRAWS = {
     "self_heating": lambda rng: SelfHeating(10 ** rng.uniform(-10, -8), rng.uniform(1, 100), 1e-6),
     "gain_drift": lambda rng: GainDrift((1.0,), (rng.uniform(-0.1, 0.1),), 1e-6),
 }
-SMOOTH = ("saturation", "contact", "gain_drift", "self_heating")
+# Effects whose inverse multiplies no rounding error, and groups by the number of others.
+SMOOTH = ("saturation", "contact", "gain_drift", "self_heating", "creep")
+GROUPS = ("without the following", "one of lag, slew, rate law, modes", "several of them")
 
 
 def family(rng, n=41):
@@ -206,7 +208,7 @@ def largest(stage, one, other, codes):
 
 def agreement(models, steps, folder, rng):
     """Compare random models on hostile paths, and the float build on smooth ones."""
-    errors, floats, sizes, each = [], {"none": [], "creep": [], "others": []}, [], max(steps // models, 200)
+    errors, floats, sizes, each = [], {group: [] for group in GROUPS}, [], max(steps // models, 200)
     for k in range(models):
         kind = ("slpi", "pi", "mpi")[k % 3]
         names = [name for name in DRAWS if rng.uniform() < (0.0, 0.3, 0.6)[k % 4 % 3]]
@@ -222,7 +224,7 @@ def agreement(models, steps, folder, rng):
         t, y = smooth(one, 20_000)
         double, codes, _ = compiled.run(np.diff(t, prepend=0.0), y)
         single, _, _ = Compiled(own, one, "-DSLPI_FLOAT").run(np.diff(t, prepend=0.0), y)
-        group = "creep" if "creep" in names else "none" if set(names) <= set(SMOOTH) else "others"
+        group = GROUPS[min(len(set(names) - set(SMOOTH)), 2)]
         floats[group].append(largest(one, single, double, codes))
         if sys.stderr.isatty():
             print(f"\r{k + 1} of {models}", end="", file=sys.stderr)

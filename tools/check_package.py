@@ -63,6 +63,7 @@ def missing(wheel: Path) -> set[str]:
     package = [path for path in (ROOT / "slpi_ros").rglob("*") if path.suffix == ".py" or path.name == "py.typed"]
     wanted = {str(path.relative_to(ROOT)) for path in package}
     wanted |= {f"slpi_ros/reports/assets/{path.name}" for path in (ROOT / "slpi_ros/reports/assets").iterdir()}
+    wanted |= {f"slpi_ros/export/templates/{path.name}" for path in (ROOT / "slpi_ros/export/templates").iterdir()}
     wanted |= {f"slpi_ros/msg_schemas/{path.name}" for path in (ROOT / "msg_schemas").glob("*.json")}
     for folder, pattern in (("launch", "*.py"), ("config", "*"), ("msg_schemas", "*.json")):
         wanted |= {f"{share}/{folder}/{path.name}" for path in (ROOT / folder).glob(pattern)}

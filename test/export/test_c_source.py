@@ -48,18 +48,18 @@ def differences(stage, folder, stamps, y, *flags, name="gcc"):
 def test_it_equals_the_stream(model, slew, seed):
     stage = ExportedStage.of(model, replace(FREE, slew=slew))
     with tempfile.TemporaryDirectory() as folder:
-        assert (differences(stage, Path(folder), *path(stage, 1500, seed), "-O0") <= AGREES).all()
+        assert (differences(stage, Path(folder), *path(stage, 700, seed), "-O0") <= AGREES).all()
 
 
 @pytest.mark.parametrize("kind", KINDS)
 def test_every_kind_with_every_effect(tmp_path, kind):
     stage = ExportedStage.of(one_axis(kind, EVERY), Limits(5.0, 95.0, 2e4))
-    assert (differences(stage, tmp_path, *path(stage, 1500)) <= AGREES).all()
+    assert (differences(stage, tmp_path, *path(stage, 800)) <= AGREES).all()
 
 
 def test_coupled_axes_together(tmp_path):
     stage = ExportedStage.of(two_axes(), FREE)
-    assert (differences(stage, tmp_path, *path(stage, 1500)) <= AGREES).all()
+    assert (differences(stage, tmp_path, *path(stage, 800)) <= AGREES).all()
 
 
 def test_one_of_two_axes_is_exported_as_if_the_other_rested(tmp_path):
@@ -195,7 +195,7 @@ def run_hostile(folder, stage, steps, *flags, name="gcc"):
     "flags", [SANITIZED, pytest.param((*SANITIZED, "-DSLPI_FLOAT"), marks=pytest.mark.long)], ids=["double", "float"]
 )
 def test_hostile_inputs_never_leave_the_limits(tmp_path, flags):
-    seen = run_hostile(tmp_path, ExportedStage.of(two_axes(), Limits(5.0, 90.0, 1e4)), 20_000, *flags)
+    seen = run_hostile(tmp_path, ExportedStage.of(two_axes(), Limits(5.0, 90.0, 1e4)), 10_000, *flags)
     assert min(seen[:4]) > 0
 
 

@@ -86,6 +86,7 @@ def test_a_file_in_the_way_of_the_folder_is_an_error_of_one_line(model, tmp_path
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
+@pytest.mark.long
 def test_units_are_written(tmp_path, capsys):
     save_model(one_axis("pi", EVERY[:2]), tmp_path / "model.json")
     out = tmp_path / "units"

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from drivers.kinds import KINDS
 
-from slpi_ros.drivers import labjack, nidaqmx, stream
+from slpi_ros.drivers import gcs_waves, labjack, nidaqmx, stream
 from slpi_ros.model.limits import Limits
 from slpi_ros.nodes.device_block import BlockRequest, Told
 from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings, State
@@ -196,6 +196,7 @@ def test_stopped_it_holds_where_it_is(bench, how):
     assert bench.largest_step <= SLEW * 2.0 / RATE
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bench", [(name, 1, [20.0], True) for name in ("gcs", "labjack", "nidaqmx")], indirect=True)
 @pytest.mark.parametrize("kind", [SILENT, LOST])
 def test_a_link_that_is_lost_ends_the_block_here(bench, kind):
@@ -213,6 +214,16 @@ def test_a_link_that_is_lost_ends_the_block_here(bench, kind):
     if bench.kind.device == "gcs":
         assert there == v[-1].tolist()
     assert bench.largest_step <= SLEW * 2.0 / RATE
+
+
+def test_a_controller_without_these_parameters_is_used_without_blocks(monkeypatch):
+    monkeypatch.setattr(gcs_waves, "WAVE_POINTS", "0x13000099")
+    with KINDS["gcs"].simulate(voltages=[20.0]) as simulator:
+        device = KINDS["gcs"].make(simulator)
+        simulator.fail(10)
+        assert any("10" in note for note in device.open().notes) and device.block_period == 0.0
+        device.write([21.0])
+        device.close()
 
 
 @pytest.mark.parametrize("bench", [("gcs", 1, [20.0], False)], indirect=True)

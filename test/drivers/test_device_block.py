@@ -1,6 +1,7 @@
 """Blocks of voltages, judged by the log of the simulated device: played by its clock, or streamed."""
 
 import re
+import threading
 import time
 from collections import deque
 
@@ -214,6 +215,23 @@ def test_a_link_that_is_lost_ends_the_block_here(bench, kind):
     if bench.kind.device == "gcs":
         assert there == v[-1].tolist()
     assert bench.largest_step <= SLEW * 2.0 / RATE
+
+
+@pytest.mark.parametrize("bench", [("gcs", 1, [20.0], True), ("nidaqmx", 1, [20.0], True)], indirect=True)
+def test_the_end_of_the_driver_stops_a_block_where_it_is(bench):
+    v = wave(40_000, 5e-4, 20.0)
+    bench.submit(v, 5e-4)
+    thread = threading.Thread(target=bench.loop.run)
+    thread.start()
+    while not bench.simulator.log:
+        time.sleep(1e-3)
+    bench.loop.end()
+    thread.join()
+    assert bench.told[-1] is Told.STOPPED and 0 < bench.states[-1].sample < len(v)
+    there = bench.kind.volts(bench.simulator)
+    assert there == pytest.approx(v[bench.states[-1].sample - 1].tolist(), abs=1e-9)
+    bench.simulator.move()
+    assert bench.kind.volts(bench.simulator) == there
 
 
 def test_a_controller_without_these_parameters_is_used_without_blocks(monkeypatch):

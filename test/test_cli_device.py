@@ -15,7 +15,9 @@ def doctor(*arguments):
     return completed("slpi_ros.cli:main", ["doctor", *map(str, arguments)])
 
 
-@pytest.mark.parametrize("name", ["gcs", "labjack", "nv200", "mdt"])
+@pytest.mark.parametrize(
+    "name", ["gcs", *(pytest.param(name, marks=pytest.mark.long) for name in ("labjack", "nidaqmx", "nv200", "mdt"))]
+)
 def test_a_device_is_read_and_a_yaml_is_printed(name):
     kind = KINDS[name]
     with kind.simulate(voltages=[20.0]) as simulator:

@@ -6,6 +6,7 @@ page 178).
 """
 
 import math
+import re
 import time
 from collections.abc import Generator, Mapping, Sequence
 from dataclasses import replace
@@ -80,14 +81,16 @@ class GcsDevice(Device):
         ids = " ".join(self._axes)
         volts = f"VOL? {' '.join(self._outputs)}" if self._outputs else f"SVA? {ids}"
         self._poll = f"POS? {ids}\n{volts}\nERR?\n".encode()
-        self._waves = GcsWaves(self.name, self._known, self._axes, axes, self._ask, self._command)
+        found = self._found(identity)
+        # After `_found`, which reads an error of the past.
+        self._waves = GcsWaves(self.name, self._known, self._axes, axes, self._ask, self._try, self._command)
         self.block_period, self.longest_block = self._waves.period, self._waves.longest
         if self.block_period and self._waves.running:
             raise UnsuitableError(
                 f"{self.name}: its wave generator is running and moves the voltage itself; wait for its end, or stop "
                 "it at the controller"
             )
-        return self._found(identity)
+        return found
 
     def release_servo(self) -> Found:
         """Switch the servo of all axes off; UnsuitableError if the voltage then is not that of ``SVA?``."""
@@ -260,6 +263,13 @@ class GcsDevice(Device):
         self._stream.require_end()
         return lines
 
+    def _try(self, question: str) -> list[str]:
+        """Return the lines of the answer to a question, none if the controller has no answer but an error."""
+        self._stream.send(f"{question}\nERR?\n".encode())
+        *lines, error = self._stream.until(_end_with_error, question).decode("latin-1").splitlines()
+        self._stream.require_end()
+        return [] if self._error(error.strip()) else [line.strip() for line in lines]
+
     def _named(self, command: str, names: Sequence[str]) -> list[float]:
         """Return the numbers that a question gives for these names."""
         return self._values(command, self._ask(f"{command} {' '.join(names)}"), names)
@@ -312,3 +322,8 @@ def _end_of_lines(count: int, data: bytes) -> int:
 
 def _end_of_answer(data: bytes) -> int:
     return len(data) if data.endswith(b"\n") and not data.endswith(b" \n") else 0
+
+
+def _end_with_error(data: bytes) -> int:
+    """Return the length of an answer that ends with that to ``ERR?``, a number without a name."""
+    return len(data) if re.search(rb"(?:^|\n)-?\d+ *\r?\n$", data) else 0

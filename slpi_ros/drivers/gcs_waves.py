@@ -23,7 +23,7 @@ POSITION, VOLTAGE = 2, 7
 
 
 class GcsWaves:
-    """Wave generators of some axes; `ask` and `command` are those of the controller."""
+    """Wave generators of some axes; `ask`, `try_to_ask` (no lines if it has no answer) and `command` are its own."""
 
     def __init__(
         self,
@@ -32,19 +32,21 @@ class GcsWaves:
         axes: Sequence[str],
         every: Sequence[str],
         ask: Callable[[str], list[str]],
+        try_to_ask: Callable[[str], list[str]],
         command: Callable[[str], None],
     ) -> None:
         self._name = name  # of the device, for messages
-        self._axes, self._ask, self._command = list(axes), ask, command
+        self._axes, self._ask, self._try, self._command = list(axes), ask, try_to_ask, command
         self._generators = [every.index(axis) + 1 for axis in axes]
-        self._records = known >= RECORDER
         self.period, self.longest = 0.0, 0
         self._count, self._played, self._block_period = 0, 0, 0.0
         if known >= NEEDED:
             self.period = self._parameter(CYCLE)
             self.longest = int(self._parameter(WAVE_POINTS)) // len(self._axes)
-        if self._records and self.period:
-            self._most = int(self._parameter(RECORD_POINTS))
+        if not self.longest:
+            self.period = 0.0
+        self._most = int(self._parameter(RECORD_POINTS)) if self.period and known >= RECORDER else 0
+        self._records = self._most > 0
 
     @property
     def running(self) -> bool:
@@ -129,8 +131,16 @@ class GcsWaves:
         return [self._number(question, line, str(each)) for line, each in zip(lines, self._generators, strict=False)]
 
     def _parameter(self, which: str) -> float:
-        (line,) = self._ask(f"SPA? {self._axes[0]} {which}")[:1]
-        return self._number("SPA?", line, f"{self._axes[0]} {which}")
+        """Return a parameter of the controller; 0 if it has none that is a number of that name."""
+        lines = self._try(f"SPA? {self._axes[0]} {which}")
+        name, equals, text = (lines or [""])[0].partition("=")
+        found = name.split()
+        try:
+            # Written with or without leading zeros.
+            known = equals and found[:1] == self._axes[:1] and int(found[-1], 16) == int(which, 16)
+            return max(float(text), 0.0) if known else 0.0
+        except ValueError:
+            return 0.0
 
     def _number(self, question: str, line: str, name: str) -> float:
         found, equals, text = line.partition("=")

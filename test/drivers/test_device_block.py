@@ -1,6 +1,7 @@
 """Blocks of voltages, judged by the log of the simulated device: played by its clock, or streamed."""
 
 import re
+import threading
 import time
 from collections import deque
 
@@ -8,7 +9,7 @@ import numpy as np
 import pytest
 from drivers.kinds import KINDS
 
-from slpi_ros.drivers import labjack, nidaqmx, stream
+from slpi_ros.drivers import gcs_waves, labjack, nidaqmx, stream
 from slpi_ros.model.limits import Limits
 from slpi_ros.nodes.device_block import BlockRequest, Told
 from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings, State
@@ -196,6 +197,7 @@ def test_stopped_it_holds_where_it_is(bench, how):
     assert bench.largest_step <= SLEW * 2.0 / RATE
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("bench", [(name, 1, [20.0], True) for name in ("gcs", "labjack", "nidaqmx")], indirect=True)
 @pytest.mark.parametrize("kind", [SILENT, LOST])
 def test_a_link_that_is_lost_ends_the_block_here(bench, kind):
@@ -213,6 +215,33 @@ def test_a_link_that_is_lost_ends_the_block_here(bench, kind):
     if bench.kind.device == "gcs":
         assert there == v[-1].tolist()
     assert bench.largest_step <= SLEW * 2.0 / RATE
+
+
+@pytest.mark.parametrize("bench", [("gcs", 1, [20.0], True), ("nidaqmx", 1, [20.0], True)], indirect=True)
+def test_the_end_of_the_driver_stops_a_block_where_it_is(bench):
+    v = wave(40_000, 5e-4, 20.0)
+    bench.submit(v, 5e-4)
+    thread = threading.Thread(target=bench.loop.run)
+    thread.start()
+    while not bench.simulator.log:
+        time.sleep(1e-3)
+    bench.loop.end()
+    thread.join()
+    assert bench.told[-1] is Told.STOPPED and 0 < bench.states[-1].sample < len(v)
+    there = bench.kind.volts(bench.simulator)
+    assert there == pytest.approx(v[bench.states[-1].sample - 1].tolist(), abs=1e-9)
+    bench.simulator.move()
+    assert bench.kind.volts(bench.simulator) == there
+
+
+def test_a_controller_without_these_parameters_is_used_without_blocks(monkeypatch):
+    monkeypatch.setattr(gcs_waves, "WAVE_POINTS", "0x13000099")
+    with KINDS["gcs"].simulate(voltages=[20.0]) as simulator:
+        device = KINDS["gcs"].make(simulator)
+        simulator.fail(10)
+        assert any("10" in note for note in device.open().notes) and device.block_period == 0.0
+        device.write([21.0])
+        device.close()
 
 
 @pytest.mark.parametrize("bench", [("gcs", 1, [20.0], False)], indirect=True)

@@ -9,8 +9,13 @@ from drivers.kinds import KINDS
 from slpi_ros.drivers.base import DeviceError, LinkError
 from slpi_ros.simulation.devices.base import FAULTS, LATE, LOST, Fault
 
+# Of each driver and each link one; the others are long.
+SHORT = ("gcs", "labjack", "nidaqmx", "nv200")
 
-@pytest.fixture(params=KINDS)
+
+@pytest.fixture(
+    params=[name if name in SHORT else pytest.param(name, marks=pytest.mark.long) for name in KINDS],
+)
 def kind(request):
     return KINDS[request.param]
 

@@ -54,7 +54,8 @@ def test_opening_only_asks():
         assert all(line.split()[0].endswith("?") for line in simulator.received)
         asked = {line.split()[0] for line in simulator.received}
     assert asked == {
-        "*IDN?", "HLP?", "SAI?", "SVO?", "ONL?", "VOL?", "SVA?", "VMI?", "VMA?", "TMN?", "TMX?", "POS?", "ERR?"
+        "*IDN?", "HLP?", "SAI?", "SVO?", "ONL?", "VOL?", "SVA?", "VMI?", "VMA?", "TMN?", "TMX?", "POS?", "ERR?",
+        "SPA?", "WGO?",
     }  # fmt: skip
     assert found.setpoints == found.reading.voltages == (37.5, -3.0)
     assert (found.lowest, found.highest, found.servo) == ((-20.0, -20.0), (120.0, 120.0), (False, False))

@@ -115,6 +115,7 @@ def test_a_path_is_played_by_the_clock_of_the_device_and_what_was_recorded_comes
     assert status.level < DiagnosticStatus.ERROR
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("how", ["empty", "stop"])
 def test_it_is_stopped_where_it_is(bench, how):
     bench.send(path(bench.model, 3.0, 1e-3), 1e-3)

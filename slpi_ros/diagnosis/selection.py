@@ -363,7 +363,9 @@ def _grown(base: Explanation, family: Explanation | None, beginnings: tuple[Effe
         trials = max(trials, best.trials)
         if EFFECTS[best.name].companion():
             best = best.refined(CONVERGED)
-        beside = [one.effect for one in found if one.name != best.name] if begun else list(beginnings[1:])
+        # What has to prove itself beside other signals, and does not, is no alternative to anything either.
+        sound = [one for one in found if not one.effect.proved_beside or one.counts_beside(now)]
+        beside = [one.effect for one in sound if one.name != best.name] if begun else list(beginnings[1:])
         # It has proved itself beside these.
         beside = [effect for effect in beside if effect.name not in best.effect.proved_beside]
         if not beginnings:

@@ -172,6 +172,8 @@ def contenders(now: Explanation, names: Iterable[str] | None = None) -> list[Con
     sound = [one for one in _refined(tried, now, most) if one.effect.plausible(seen(one.explanation))]
     # Of an effect that was refined from several forms, the best.
     sound = [min((one for one in sound if one.name == name), key=_error) for name in {one.name: None for one in sound}]
+    # What has to prove itself beside other signals, and does not, stands for these, and is no rival of anything.
+    sound = [one for one in sound if not one.effect.proved_beside or one.counts_beside(now)]
     several = len(now.evidence.parts) > 1
 
     def rank(one: Contender) -> tuple[bool, bool, float]:
@@ -363,9 +365,7 @@ def _grown(base: Explanation, family: Explanation | None, beginnings: tuple[Effe
         trials = max(trials, best.trials)
         if EFFECTS[best.name].companion():
             best = best.refined(CONVERGED)
-        # What has to prove itself beside other signals, and does not, is no alternative to anything either.
-        sound = [one for one in found if not one.effect.proved_beside or one.counts_beside(now)]
-        beside = [one.effect for one in sound if one.name != best.name] if begun else list(beginnings[1:])
+        beside = [one.effect for one in found if one.name != best.name] if begun else list(beginnings[1:])
         # It has proved itself beside these.
         beside = [effect for effect in beside if effect.name not in best.effect.proved_beside]
         if not beginnings:

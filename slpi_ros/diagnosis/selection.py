@@ -171,6 +171,8 @@ def contenders(now: Explanation, names: Iterable[str] | None = None) -> list[Con
     sound = [one for one in _refined(tried, now, most) if one.effect.plausible(seen(one.explanation))]
     # Of an effect that was refined from several forms, the best.
     sound = [min((one for one in sound if one.name == name), key=_error) for name in {one.name: None for one in sound}]
+    # What has to prove itself beside other signals, and does not, stands for these, and is no rival of anything.
+    sound = [one for one in sound if not one.effect.proved_beside or one.counts_beside(now)]
     several = len(now.evidence.parts) > 1
 
     def rank(one: Contender) -> tuple[bool, bool, float]:

@@ -68,7 +68,7 @@ class _Test:
         signal *= AMPLITUDE * (high - low) / np.abs(signal).max()
         self._signal = np.fft.rfft(signal)
         self._signal[0] = 1.0
-        self._t = np.arange((REPEATED + 1) * SAMPLES) * dt
+        self._t: FloatArray = np.arange((REPEATED + 1) * SAMPLES, dtype=np.float64) * dt
         centre = np.full(self._t.size, 0.5 * (low + high))
         lead = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, SAMPLES // 2))
         start = stage.start.displacement
@@ -103,4 +103,3 @@ def _changed(effect: Effect) -> Iterator[Effect]:
                 yield effect.with_free(numbers)
             except SlpiError:
                 continue
-

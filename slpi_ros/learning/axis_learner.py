@@ -31,6 +31,8 @@ LIMIT_SHARE = 0.25
 CLOSING_STEPS, LED_BACK, TAPER = 1.5, 0.25, 0.02
 # Samples in a row at a voltage limit that count as held there, and share of the range by which it is reached.
 HELD_SAMPLES, AT_LIMIT = 3, 1e-6
+# Readings further from the path than this many strokes are none.
+FAR = 10.0
 # Hashes of passes that are kept to find a replayed one, and passes whose figures are kept.
 KEPT_HASHES, KEPT_PASSES = 64, 10_000
 # Largest answer to a change of the path that is still taken for one, as a multiple of the change.
@@ -134,6 +136,8 @@ class AxisLearner:
             if self.axis.corrects
             else measured
         )
+        low, high = self.axis.displacement_range
+        seen = np.where(np.abs(seen - self.desired) <= FAR * (high - low), seen, np.nan)
         first = not self.harmonics.passes
         correction = self._spectrum(self.correction)
         expected = self.desired if first else self._signal(self.harmonics.expected(correction))
@@ -141,14 +145,14 @@ class AxisLearner:
         change = self._spectrum(self.correction - self._last)
         own = ANSWER**2 * self._power(np.abs(change) ** 2)
         power = own + self._power(self.harmonics.variance(correction) + self.harmonics.noise) if not first else math.inf
-        error = self.passes[-1].error if self.passes else math.inf
+        error = next((one.error for one in reversed(self.passes) if one.learned), math.inf)
         if self._previous is not None and not change.any():
             # The same path again: the same reading, but for what is still settling.
             expected, power = self._previous, 2.0 * self.noise**2
         judged = judge(seen, expected, math.sqrt(power), floor, self._deviating, error)
         if self._lead_in is not None and not judged.reason:
             judged = agreed(self._lead_in, judged, self.desired, floor)
-        reason = judged.reason or self._replayed(measured) or self._held_back(voltage)
+        reason = self._replayed(measured) or judged.reason or self._held_back(voltage)
         offset, drift = self._offset_and_drift(judged, expected, first=first)
         clean = judged.measured - offset - drift * (np.arange(measured.size) / measured.size - 0.5)
         rest = (clean - self.desired)[np.isfinite(clean)]

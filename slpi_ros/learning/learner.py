@@ -65,7 +65,8 @@ class Learner:
         self.t = check_time(t)
         if self.t.size < FEWEST:
             raise UsageError(f"a pass of {self.t.size} samples is too short; give at least {FEWEST}")
-        dt = float(self.t[-1] - self.t[0]) / (self.t.size - 1)
+        # The same for the same path at any time of day.
+        dt = self._interval = round(float(self.t[-1] - self.t[0]) / (self.t.size - 1), 12)
         if not dt > 0.0 or float(np.abs(np.diff(self.t) - dt).max()) > UNEVEN * dt:
             raise UsageError("the times of a pass are not evenly spaced; interpolate the path at even times")
         if learn_limit is not None and not 0.0 < learn_limit < np.inf:
@@ -126,7 +127,7 @@ class Learner:
         return {
             "schema": SCHEMA,
             "hardware_id": self.model.hardware_id,
-            "interval_s": float(self.t[-1] - self.t[0]) / (self.t.size - 1),
+            "interval_s": self._interval,
             "path": path_identity(self.t, {name: axis.desired for name, axis in self.axes.items()}),
             "axes": {name: {"model": self._identity(name)} | axis.to_document() for name, axis in self.axes.items()},
         }

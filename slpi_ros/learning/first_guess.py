@@ -16,8 +16,6 @@ from slpi_ros.model.axis_model import AxisModel
 DOUBT, DOUBT_HZ = 0.05, 150.0
 # Standard errors of an effect's parameter by which it may be wrong, and the least relative one.
 STANDARD_ERRORS, LEAST_RELATIVE = 2.0, 0.02
-# Effects whose errors act as a gain of each harmonic.
-LINEAR = ("delay", "lag", "rate_dependence", "creep", "resonance")
 # Samples of the test signal, its repetitions until it has settled, and its amplitude as a share of the stroke.
 SAMPLES, REPEATED, AMPLITUDE = 2048, 3, 1e-3
 
@@ -92,7 +90,7 @@ def _others(stage: AxisModel) -> Iterator[AxisModel]:
 
 
 def _changed(effect: Effect) -> Iterator[Effect]:
-    if effect.name not in LINEAR:
+    if not (effect.dynamic or getattr(effect, "modes", ())):
         return
     leaves = effect.free_leaves()
     for at, leaf in enumerate(leaves):

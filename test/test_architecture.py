@@ -22,6 +22,7 @@ LAYERS = (
     {"workflows", "export"},
     {"diagnosis"},
     {"identification", "compensator"},
+    {"learning"},
     {"model", "excitation"},
     {"effects"},
     {"hysteresis", "io", "drivers", "simulation"},

@@ -575,8 +575,8 @@ def moved(
 ) -> FloatArray:
     """Return the displacement of the moving Preisach model, shape (N,), in strokes.
 
-    `state`, shape (M,), whether each relay is up, and `felt`, shape (1,), the displacement (strokes) that acts back, are
-    modified.
+    `state`, shape (M,), whether each relay is up, and `felt`, shape (1,), the displacement (strokes) that acts back,
+    are modified.
 
     Parameters
     ----------

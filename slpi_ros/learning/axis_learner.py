@@ -1,4 +1,4 @@
-"""One axis of a path that repeats: from each pass to the correction of the next one, and the rules that keep it safe."""
+"""One axis of a path that repeats: from each pass to the correction of the next one, and the rules for safety."""
 
 import hashlib
 import math
@@ -16,7 +16,7 @@ from slpi_ros.learning.passes import Judged, agreed, judge
 from slpi_ros.model.axis_model import AxisModel
 
 # Gain of a step towards the desired path, at first.
-GAIN = 0.8
+GAIN = 0.6
 # A pass is worse than the best from this ratio of their errors on, beyond this many standard deviations of the noise.
 WORSE, WORSE_BY_NOISE = 1.1, 4.0
 # Times that learning goes back to the best pass without a better one since, and passes in a row that cannot be learned
@@ -26,11 +26,13 @@ MOST_RETURNS, MOST_REFUSED = 2, 3
 BEST_PASSES = 50
 # Largest part of the stroke that learning may add to the desired path, by default.
 LIMIT_SHARE = 0.25
-# A path closes if its ends differ by less than this many of its largest steps; otherwise it is led back to its beginning
-# over this share of it, and the correction begins and ends at 0, over this share.
+# A path closes if its ends differ by less than this many of its largest steps; otherwise it is led back to its
+# beginning over this share of it, and the correction begins and ends at 0, over this share.
 CLOSING_STEPS, LED_BACK, TAPER = 1.5, 0.25, 0.02
 # Samples in a row at a voltage limit that count as held there, and share of the range by which it is reached.
 HELD_SAMPLES, AT_LIMIT = 3, 1e-6
+# Readings further from the path than this many strokes are none.
+FAR = 10.0
 # Hashes of passes that are kept to find a replayed one, and passes whose figures are kept.
 KEPT_HASHES, KEPT_PASSES = 64, 10_000
 # Largest answer to a change of the path that is still taken for one, as a multiple of the change.
@@ -46,8 +48,8 @@ CLEAR = 2.0
 class PassReport:
     """Figures of one pass of one axis.
 
-    `error` is what repeats and can be learned: rms of measured - desired without the mean and the drift of the pass, which
-    are `offset` (m) and `drift` (m over the pass); `absolute` is the rms with both. `bumps`: samples left out as a bump.
+    `error` is what repeats and can be learned: rms of measured - desired without the mean and the drift of the pass,
+    which are `offset` (m) and `drift` (m over the pass); `absolute` is the rms with both. `bumps`: samples left out.
     `reason`: why the pass was not learned from, or what it led to; "" if it was learned from. `limited_by`: what keeps
     the error where it is. `bandwidth` (Hz): below it the phase of every harmonic is known.
     """
@@ -88,7 +90,7 @@ class AxisLearner:
             rise = 0.5 - 0.5 * np.cos(np.pi * np.arange(edge) / edge)
             self.taper[:edge], self.taper[-edge:] = rise, rise[::-1]
         self.wanted = self._spectrum(desired)
-        self.frequency = np.fft.rfftfreq(self._size, dt)
+        self.frequency: FloatArray = np.asarray(np.fft.rfftfreq(self._size, dt), dtype=np.float64)
         self.correction = np.zeros(desired.size)
         self.passes: list[PassReport] = []
         self.gain, self.held, self.returns, self.refused = GAIN, "", 0, 0
@@ -123,9 +125,19 @@ class AxisLearner:
         """Standard deviation of one reading from pass to pass, metres."""
         return math.sqrt(self._power(self.harmonics.noise))
 
-    def update(self, measured: FloatArray, voltage: FloatArray | None = None) -> PassReport:
-        """Learn from a pass with the present `path`; `measured` (m), `voltage` (V), shape (N,)."""
-        seen = self.axis.correct(np.arange(measured.size) * self.dt, measured) if self.axis.corrects else measured
+    def update(
+        self, measured: FloatArray, voltage: FloatArray | None = None, followed: FloatArray | None = None
+    ) -> PassReport:
+        """Learn from a pass of which the path `followed` (m; default: `path`) was asked; shape (N,), m and V."""
+        if followed is not None:
+            self.correction = followed - self.desired
+        seen = (
+            self.axis.correct(np.arange(measured.size, dtype=np.float64) * self.dt, measured)
+            if self.axis.corrects
+            else measured
+        )
+        low, high = self.axis.displacement_range
+        seen = np.where(np.abs(seen - self.desired) <= FAR * (high - low), seen, np.nan)
         first = not self.harmonics.passes
         correction = self._spectrum(self.correction)
         expected = self.desired if first else self._signal(self.harmonics.expected(correction))
@@ -133,14 +145,14 @@ class AxisLearner:
         change = self._spectrum(self.correction - self._last)
         own = ANSWER**2 * self._power(np.abs(change) ** 2)
         power = own + self._power(self.harmonics.variance(correction) + self.harmonics.noise) if not first else math.inf
-        error = self.passes[-1].error if self.passes else math.inf
+        error = next((one.error for one in reversed(self.passes) if one.learned), math.inf)
         if self._previous is not None and not change.any():
             # The same path again: the same reading, but for what is still settling.
             expected, power = self._previous, 2.0 * self.noise**2
         judged = judge(seen, expected, math.sqrt(power), floor, self._deviating, error)
         if self._lead_in is not None and not judged.reason:
             judged = agreed(self._lead_in, judged, self.desired, floor)
-        reason = judged.reason or self._replayed(measured) or self._held_back(voltage)
+        reason = self._replayed(measured) or judged.reason or self._held_back(voltage)
         offset, drift = self._offset_and_drift(judged, expected, first=first)
         clean = judged.measured - offset - drift * (np.arange(measured.size) / measured.size - 0.5)
         rest = (clean - self.desired)[np.isfinite(clean)]
@@ -176,7 +188,9 @@ class AxisLearner:
         if h.passes:
             self.harmonics = h.after(correction, seen)
         else:
-            self.harmonics = h.begun(self.wanted + correction, seen, seen if lead_in is None else self._spectrum(lead_in))
+            self.harmonics = h.begun(
+                self.wanted + correction, seen, seen if lead_in is None else self._spectrum(lead_in)
+            )
         number, best = len(self.passes) + 1, self.best
         if best is not None and number - best.number > BEST_PASSES:
             best = None
@@ -345,6 +359,13 @@ class AxisLearner:
             "desired_m": self.desired.tolist(),
             "correction_m": self.correction.tolist(),
             "last_correction_m": self._last.tolist(),
+            "previous_m": _listed(self._previous),
+            "changed_m": _listed(self._changed),
+            "lead_in_m": _listed(self._lead_in),
+            "since": self._since,
+            "dwell": self._dwell,
+            "returned": self._returned,
+            "record_m2": self.record if math.isfinite(self.record) else None,
             "learn_limit_m": self.limit,
             "gain": self.gain,
             "held": self.held,
@@ -353,7 +374,11 @@ class AxisLearner:
             "offset_m": self._offset,
             "deviating": None if self._deviating is None else np.flatnonzero(self._deviating).tolist(),
             "best": self.best
-            and {"number": self.best.number, "power_m2": self.best.power, "correction_m": self.best.correction.tolist()},
+            and {
+                "number": self.best.number,
+                "power_m2": self.best.power,
+                "correction_m": self.best.correction.tolist(),
+            },
             "hashes": self._hashes,
             "harmonics": {
                 "gain": _pairs(h.gain),
@@ -380,6 +405,10 @@ class AxisLearner:
         if len(numbers["noise_m2"]) != h.noise.size:
             raise ModelError(f"{len(numbers['noise_m2'])} harmonics, not {h.noise.size}; learn the path anew")
         self._last = np.array(document["last_correction_m"])
+        self._previous, self._changed = _array(document["previous_m"]), _array(document["changed_m"])
+        self._lead_in, self._since = _array(document["lead_in_m"]), document["since"]
+        self._dwell, self._returned = document["dwell"], document["returned"]
+        self.record = math.inf if document["record_m2"] is None else document["record_m2"]
         self.gain, self.held = document["gain"], document["held"]
         self.returns, self.refused, self._offset = document["returns"], document["refused"], document["offset_m"]
         if document["deviating"] is not None:
@@ -399,6 +428,14 @@ class AxisLearner:
             noise=np.array(numbers["noise_m2"]),
             passes=numbers["passes"],
         )
+
+
+def _listed(x: FloatArray | None) -> list[float] | None:
+    return None if x is None else x.tolist()
+
+
+def _array(values: list[float] | None) -> FloatArray | None:
+    return None if values is None else np.array(values, dtype=np.float64)
 
 
 def _pairs(x: ComplexArray) -> list[list[float]]:

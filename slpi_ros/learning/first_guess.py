@@ -16,8 +16,6 @@ from slpi_ros.model.axis_model import AxisModel
 DOUBT, DOUBT_HZ = 0.05, 150.0
 # Standard errors of an effect's parameter by which it may be wrong, and the least relative one.
 STANDARD_ERRORS, LEAST_RELATIVE = 2.0, 0.02
-# Effects whose errors act as a gain of each harmonic.
-LINEAR = ("delay", "lag", "rate_dependence", "creep", "resonance")
 # Samples of the test signal, its repetitions until it has settled, and its amplitude as a share of the stroke.
 SAMPLES, REPEATED, AMPLITUDE = 2048, 3, 1e-3
 
@@ -68,7 +66,7 @@ class _Test:
         signal *= AMPLITUDE * (high - low) / np.abs(signal).max()
         self._signal = np.fft.rfft(signal)
         self._signal[0] = 1.0
-        self._t = np.arange((REPEATED + 1) * SAMPLES) * dt
+        self._t: FloatArray = np.arange((REPEATED + 1) * SAMPLES, dtype=np.float64) * dt
         centre = np.full(self._t.size, 0.5 * (low + high))
         lead = 0.5 - 0.5 * np.cos(np.linspace(0.0, np.pi, SAMPLES // 2))
         start = stage.start.displacement
@@ -92,7 +90,7 @@ def _others(stage: AxisModel) -> Iterator[AxisModel]:
 
 
 def _changed(effect: Effect) -> Iterator[Effect]:
-    if effect.name not in LINEAR:
+    if not (effect.dynamic or getattr(effect, "modes", ())):
         return
     leaves = effect.free_leaves()
     for at, leaf in enumerate(leaves):
@@ -103,4 +101,3 @@ def _changed(effect: Effect) -> Iterator[Effect]:
                 yield effect.with_free(numbers)
             except SlpiError:
                 continue
-

@@ -18,21 +18,23 @@ TEST_SHARE, TEST_ABOVE = 0.1, 3.0
 LEAST_GAIN = 0.2
 # Standard deviation of what is left of the hysteresis, as a share of the path's harmonics nearby.
 REST_SHARE, TURN_SHARE = 0.1, 0.02
-# Least variance of a gain; random walk of a gain from pass to pass (variance), and of the repeating error (share of its noise).
+# Least variance of a gain; random walk of a gain from pass to pass (variance), and of the repeating error (share of its
+# noise).
 LEAST_VARIANCE, GAIN_WALK, ERROR_WALK = 1e-8, 1e-4, 0.02
 # Share of an unexpected change, as in the neighbouring harmonics, that is taken for a change of the repeating error.
-CHANGED_SHARE, NEIGHBOURS = 0.5, 5
+CHANGED_SHARE, NEIGHBOURS = 0.2, 3
 # A share of the noise's new estimate in each pass, of one harmonic and (by this number of harmonics) of the floor.
 NOISE_SHARE, FLOOR_COUNT = 0.1, 200.0
 
 
 @dataclass(frozen=True)
 class Harmonics:
-    """What is known of the harmonics of one pass of N samples; arrays of shape (K,), K = N // 2 + 1, as `numpy.fft.rfft`.
+    """What is known of the harmonics of a pass of N samples; arrays of shape (K,), K = N // 2 + 1, as `numpy.fft.rfft`.
 
-    The reading of harmonic k for a correction ``C`` of the desired path is ``Y = d + G C + n``. The gain ``G`` is constant
-    but for a small random walk, ``d`` (what is read without a correction) walks by what the passes themselves show, and
-    ``n`` is noise. Both are estimated together from all passes: a scalar reading and a state of two for each harmonic.
+    The reading of harmonic k for a correction ``C`` of the desired path is ``Y = d + G C + n``. The gain ``G`` is
+    constant but for a small random walk, ``d`` (what is read without a correction) walks by what the passes themselves
+    show, and ``n`` is noise. Both are estimated together from all passes: a scalar reading and a state of two for each
+    harmonic.
 
     Parameters
     ----------
@@ -49,7 +51,8 @@ class Harmonics:
 
     References
     ----------
-    D. A. Bristow, M. Tharayil, A. G. Alleyne, A survey of iterative learning control, IEEE Control Syst. Mag. 26 (2006).
+    D. A. Bristow, M. Tharayil, A. G. Alleyne, A survey of iterative learning control, IEEE Control Syst. Mag. 26
+    (2006).
     N. Amann, D. H. Owens, E. Rogers, Iterative learning control using optimal feedback and feedforward actions, Int. J.
     Control 65 (1996).
     """
@@ -70,13 +73,13 @@ class Harmonics:
 
     def expected(self, correction: ComplexArray) -> ComplexArray:
         """Return the expected reading, (K,), metres, of a pass with a correction (m)."""
-        return self.without + self.gain * correction
+        return np.asarray(self.without + self.gain * correction)
 
     def variance(self, correction: ComplexArray) -> FloatArray:
         """Return the variance of `expected`, (K,), metres squared."""
-        size = np.abs(correction) ** 2
+        size: FloatArray = np.abs(correction) ** 2
         cross = 2.0 * (self.covariance * correction).real
-        return np.maximum(self.gain_variance * size + cross + self.without_variance, 0.0)
+        return np.asarray(np.maximum(self.gain_variance * size + cross + self.without_variance, 0.0))
 
     @property
     def phase_known(self) -> Mask:
@@ -139,14 +142,14 @@ class Harmonics:
         share = min(upper.size / FLOOR_COUNT, 1.0) * max(NOISE_SHARE, 0.5 / self.passes)
         floor = float(self.noise.min()) * float(np.clip(level, 0.25, 4.0)) ** share
         own = self.noise * (1.0 + NOISE_SHARE * (np.clip(ratio, 0.0, 4.0) - 1.0))
-        return np.maximum(own, floor)
+        return np.asarray(np.maximum(own, floor))
 
     def step(self, correction: ComplexArray, desired: ComplexArray, gain: float) -> ComplexArray:
         """Return the change of the correction, (K,), metres, towards the desired path; the mean is left alone.
 
         The estimated error is divided by the gain where the phase is known to 45 degrees, less where the gain is
-        uncertain (``conj(G) / (|G|^2 + P)``), and not by what may be noise. Elsewhere a test step is made that cannot change the error by more than a tenth: from its response the
-        gain is learned.
+        uncertain (``conj(G) / (|G|^2 + P)``), and not by what may be noise. Elsewhere a test step is made whose answer
+        is at most a tenth of the error, or of the size of the noise: from it the gain is learned.
         """
         error = desired - self.expected(correction)
         size, variance = np.abs(error), self.variance(correction)
@@ -154,9 +157,10 @@ class Harmonics:
         power = np.abs(self.gain) ** 2 + self.gain_variance
         full = self.gain.conj() / np.maximum(power, LEAST_GAIN**2) * error
         step = gain * sure * full
-        largest = TEST_SHARE * size / (np.abs(self.gain) + 2.0 * np.sqrt(self.gain_variance))
+        answer = np.maximum(TEST_SHARE * size, np.minimum(0.5 * size, np.sqrt(self.noise)))
+        largest = answer / (np.abs(self.gain) + 2.0 * np.sqrt(self.gain_variance))
         test = full * (largest / np.maximum(np.abs(full), 1e-300))
-        worth = size > TEST_ABOVE * np.sqrt(variance + self.noise)
+        worth = size > TEST_ABOVE * np.sqrt(variance)
         step = np.where(self.phase_known, step, np.where(worth, test, 0.0))
         step[0] = 0.0
         return step

@@ -26,9 +26,9 @@ FEWEST, UNEVEN = 8, 0.2
 class Learner:
     """Learns the correction of a path that repeats, pass by pass, harmonic by harmonic.
 
-    The correction is made to the desired path, before the inverse, so that what is learned is nearly linear. Each harmonic
-    has a complex gain that is learned, too, see `slpi_ros.learning.harmonics.Harmonics`; the rules that keep learning from
-    doing harm are in `slpi_ros.learning.axis_learner.AxisLearner`.
+    The correction is made to the desired path, before the inverse, so that what is learned is nearly linear. Each
+    harmonic has a complex gain that is learned, too, see `slpi_ros.learning.harmonics.Harmonics`; the rules that keep
+    learning from doing harm are in `slpi_ros.learning.axis_learner.AxisLearner`.
 
     Parameters
     ----------
@@ -65,7 +65,8 @@ class Learner:
         self.t = check_time(t)
         if self.t.size < FEWEST:
             raise UsageError(f"a pass of {self.t.size} samples is too short; give at least {FEWEST}")
-        dt = float(self.t[-1] - self.t[0]) / (self.t.size - 1)
+        # The same for the same path at any time of day.
+        dt = self._interval = round(float(self.t[-1] - self.t[0]) / (self.t.size - 1), 12)
         if not dt > 0.0 or float(np.abs(np.diff(self.t) - dt).max()) > UNEVEN * dt:
             raise UsageError("the times of a pass are not evenly spaced; interpolate the path at even times")
         if learn_limit is not None and not 0.0 < learn_limit < np.inf:
@@ -84,8 +85,8 @@ class Learner:
         """Return what to compensate in the next pass, metres, in the form of `desired`; at first the desired path."""
         return self._in_form({name: axis.path for name, axis in self.axes.items()})
 
-    def update(self, measured: Signal, voltage: Signal | None = None) -> Any:
-        """Learn from the pass that has just ended, which followed `path`.
+    def update(self, measured: Signal, voltage: Signal | None = None, *, followed: Signal | None = None) -> Any:
+        """Learn from the pass that has just ended.
 
         Parameters
         ----------
@@ -93,6 +94,9 @@ class Learner:
             Readings of the sensors at the times of the pass; NaN where there is none.
         voltage : as `desired`, optional, volts
             Voltage in the pass, if it is known: a pass that a limit held back is not learned from.
+        followed : as `desired`, optional, metres
+            What was asked of the compensator in the pass; default: the last `path`. A pass that had begun before `path`
+            was known, or that was repeated by hand, followed an earlier one.
 
         Returns
         -------
@@ -103,7 +107,10 @@ class Learner:
         applied = {} if voltage is None else self._by_axis(voltage, "voltage")
         if missing := self.axes.keys() - seen.keys():
             raise UsageError(f"no readings of axis '{min(missing)}'; give those of every axis of the path")
-        return self._in_form({name: axis.update(seen[name], applied.get(name)) for name, axis in self.axes.items()})
+        asked = {} if followed is None else self._by_axis(followed, "followed")
+        return self._in_form(
+            {name: axis.update(seen[name], applied.get(name), asked.get(name)) for name, axis in self.axes.items()}
+        )
 
     @property
     def passes(self) -> dict[str, list[PassReport]]:
@@ -120,7 +127,7 @@ class Learner:
         return {
             "schema": SCHEMA,
             "hardware_id": self.model.hardware_id,
-            "interval_s": float(self.t[-1] - self.t[0]) / (self.t.size - 1),
+            "interval_s": self._interval,
             "path": path_identity(self.t, {name: axis.desired for name, axis in self.axes.items()}),
             "axes": {name: {"model": self._identity(name)} | axis.to_document() for name, axis in self.axes.items()},
         }
@@ -128,8 +135,8 @@ class Learner:
     def resume(self, document: Mapping[str, Any], source: str = "learned") -> list[str]:
         """Go on from a document of the same stage and path; return remarks.
 
-        Of another model, learning begins anew from the correction of the path. ModelError, which begins with `source`, if
-        the document is not valid, or of another stage or path.
+        Of another model, learning begins anew from the correction of the path. ModelError, which begins with `source`,
+        if the document is not valid, or of another stage or path.
         """
         validate(document, "learned", source)
         if document["hardware_id"] != self.model.hardware_id:
@@ -160,12 +167,7 @@ class Learner:
 
     def load(self, path: str | os.PathLike[str]) -> list[str]:
         """Go on from a file that `save` wrote; return remarks. ModelError as `resume`, or if it cannot be read."""
-        try:
-            document = json.loads(read_input(path, MODEL_BYTES).decode())
-        except (OSError, ValueError, RecursionError) as error:
-            reason = error.strerror if isinstance(error, OSError) else "it is no JSON document"
-            raise ModelError(f"{path}: cannot read what was learned: {reason}; leave it out to learn anew") from None
-        return self.resume(document, str(path))
+        return self.resume(read_learned(path), str(path))
 
     def _identity(self, axis: str) -> str:
         return hashlib.sha256(format_model(StageModel({axis: self.model.axes[axis]})).encode()).hexdigest()
@@ -174,8 +176,8 @@ class Learner:
         if not isinstance(signal, Mapping):
             if not self._default:
                 raise UsageError(
-                    f"the model holds axes {', '.join(self.model.axes)}; give {what} as a mapping of axis name to array, "
-                    "or name the axis"
+                    f"the model holds axes {', '.join(self.model.axes)}; give {what} as a mapping of axis name to "
+                    "array, or name the axis"
                 )
             signal = {self._default: signal}
         found: dict[str, FloatArray] = {}
@@ -202,3 +204,15 @@ def path_identity(t: FloatArray, desired: Mapping[str, FloatArray]) -> str:
     for name in sorted(desired):
         digest.update(name.encode() + np.round(1e12 * desired[name]).astype(np.int64).tobytes())
     return digest.hexdigest()
+
+
+def read_learned(path: str | os.PathLike[str]) -> dict[str, Any]:
+    """Read a document of what was learned from a file; ModelError if it is none."""
+    try:
+        document = json.loads(read_input(path, MODEL_BYTES).decode())
+    except (OSError, ValueError, RecursionError) as error:
+        reason = error.strerror if isinstance(error, OSError) else "it is no JSON document"
+        raise ModelError(f"{path}: cannot read what was learned: {reason}; leave it out to learn anew") from None
+    validate(document, "learned", str(path))
+    found: dict[str, Any] = document
+    return found

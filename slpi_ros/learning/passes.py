@@ -73,7 +73,8 @@ def judge(
     scale = max(float(np.median(np.abs(surprise[known]))) / 0.6745, noise, 0.5 * spread)
     deviating = np.abs(surprise) > BUMP * scale
     # What deviates in two passes at the same samples repeats, and is learned.
-    bumps = _widened(deviating) & ~_widened(before) if deviating.any() else nowhere
+    repeated = nowhere if before is None else _widened(before)
+    bumps = _widened(deviating) & ~repeated if deviating.any() else nowhere
     if float(np.mean(bumps)) > MOST_BUMP:
         bumps = nowhere
     bumps = bumps | ~known
@@ -131,7 +132,9 @@ def _why(surprise: FloatArray, expected: FloatArray) -> str:
     power, whole = float(rate @ rate), float(surprise @ surprise)
     shift = float(surprise @ rate) / power if power > 0.0 else 0.0
     if shift * shift * power > LATE_SHARE * whole:
-        return f"the reading is {'late' if shift < 0.0 else 'early'} by {abs(shift):.2g} samples against the passes before"
+        return (
+            f"the reading is {'late' if shift < 0.0 else 'early'} by {abs(shift):.2g} samples against the passes before"
+        )
     return _step(surprise, 0.0) or "the reading does not answer to what was commanded"
 
 
@@ -144,6 +147,10 @@ def _step(surprise: FloatArray, spread: float) -> str:
     inside = (at > JUMP_INSIDE * n) & (at < (1.0 - JUMP_INSIDE) * n)
     k = int(np.argmax(np.where(inside, explained, 0.0)))
     whole = float(np.sum((surprise - surprise.mean()) ** 2))
+    # A jump is sudden: the samples on either side of it differ by as much as the halves of the pass do.
+    sudden = float(np.mean(surprise[k + 1 : k + 3]) - np.mean(surprise[max(k - 1, 0) : k + 1]))
+    if abs(sudden) < JUMP_SHARE * abs(size[k]):
+        return ""
     if abs(size[k]) > UNEXPECTED * spread and explained[k] > JUMP_SHARE * whole:
         return f"the reading jumps by {1e9 * size[k]:.3g} nm at sample {k + 1}"
     return ""

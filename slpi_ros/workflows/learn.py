@@ -1,0 +1,190 @@
+"""The next pass of a path that repeats, from the bags of its passes: read, cut into passes, learn."""
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from itertools import groupby
+from typing import Any
+
+import numpy as np
+
+from slpi_ros.arrays import FloatArray, IntArray
+from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.io.desired import DesiredPath, at_times, read_desired
+from slpi_ros.io.record import Record
+from slpi_ros.learning.axis_learner import PassReport
+from slpi_ros.learning.learner import Learner
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.workflows.records import Source, mismatch_in_data, shared_axes
+
+# Readings further apart than this many sampling intervals are a gap.
+GAP = 3.0
+
+
+@dataclass(frozen=True)
+class LearnRequest:
+    """Request of the next pass.
+
+    `desired`: times (s) and displacements (m) of one pass by axis; default: that of `learned`, else what the first pass
+    was asked for. `period` (s): the passes follow each other without a pause; default: each trajectory is a pass.
+    `learned`: document of what was learned before.
+    """
+
+    source: Source
+    model: StageModel
+    desired: tuple[FloatArray, Mapping[str, FloatArray]] | None = None
+    period: float | None = None
+    learned: Mapping[str, Any] | None = None
+    learn_limit: float | None = None
+
+
+@dataclass(frozen=True)
+class LearnedPass:
+    """One pass of all axes: where it was recorded, its error (measured - desired, m, (N,)) and what was made of it."""
+
+    source: str
+    start: float  # s, from the first stamp of its record
+    errors: Mapping[str, FloatArray]
+    reports: Mapping[str, PassReport]
+
+
+@dataclass(frozen=True)
+class LearnOutcome:
+    """What was learned, from which passes, and remarks."""
+
+    learner: Learner
+    passes: Sequence[LearnedPass]
+    remarks: Sequence[str]
+
+
+@dataclass(frozen=True)
+class _Begun:
+    """A pass in a record: its start (ns), and what was asked for, by axis; None: not recorded."""
+
+    start_ns: int
+    asked: Sequence[DesiredPath] | None
+
+
+def learn(request: LearnRequest) -> LearnOutcome:
+    """Learn from the passes of all bags, in order of time; RecordError if there is no complete pass."""
+    source, model = request.source, request.model
+    if request.period is not None and not 0.0 < request.period < math.inf:
+        raise UsageError(f"period is {request.period} s; give a positive number of seconds")
+    records = source.read(coupled=True)
+    bags = source.bags if not source.records else [""] * len(records)
+    read = sorted(zip(bags, records, strict=True), key=lambda one: int(one[1].time_ns[0]))
+    with mismatch_in_data():
+        axes = tuple(shared_axes(records, model, source))
+        for axis in axes:
+            model.axis(axis)
+    learner: Learner | None = None
+    found: list[LearnedPass] = []
+    remarks: list[str] = []
+    for bag, record in read:
+        asked = [one for one in (read_desired(bag, record.axes) if bag else []) if one.axis in axes]
+        for begun in _passes(request, record, asked, axes):
+            if learner is None:
+                learner, told = _learner(request, record, begun, axes)
+                remarks += told
+            found += _taken(learner, record, begun)
+    if learner is None or not found:
+        what = "--period, and --desired" if request.period is None else "a shorter --period, or another bag"
+        raise RecordError(f"{read[0][1].source}: holds no complete pass of the path; give {what}")
+    return LearnOutcome(learner, found, remarks)
+
+
+def _passes(
+    request: LearnRequest, record: Record, asked: Sequence[DesiredPath], axes: Sequence[str]
+) -> Sequence[_Begun]:
+    """Return the passes that begin in a record, in order."""
+    source, first_ns, last_ns = request.source, int(record.time_ns[0]), int(record.time_ns[-1])
+    trajectories = [one for one in asked if one.linear]
+    if request.period is None and trajectories:
+        ordered = sorted(trajectories, key=lambda one: int(one.time_ns[0]))
+        groups = groupby(ordered, key=lambda one: int(one.time_ns[0]))
+        each = [(start_ns, list(paths)) for start_ns, paths in groups]
+        return [_Begun(ns, paths) for ns, paths in each if {one.axis for one in paths} >= set(axes)]
+    period = request.period or _duration(request)
+    if period is None:
+        raise UsageError(
+            f"{record.source}: holds no trajectory, so that nothing tells where a pass begins; give --period, and "
+            "--desired if no desired displacements were recorded"
+        )
+    begin_ns = max([first_ns, *(int(one.time_ns[0]) for one in asked)])
+    if source.start is not None:
+        begin_ns = first_ns + round(1e9 * source.start)
+    end_ns = last_ns if source.stop is None else first_ns + round(1e9 * source.stop)
+    count = max(0, int((end_ns - begin_ns) * 1e-9 / period + 1e-6))
+    return [_Begun(begin_ns + round(1e9 * k * period), asked or None) for k in range(count)]
+
+
+def _duration(request: LearnRequest) -> float | None:
+    """Return the duration (s) of the desired pass, if it is known."""
+    if request.learned is not None:
+        learned = next(iter(request.learned["axes"].values()))
+        return float(request.learned["interval_s"] * len(learned["desired_m"]))
+    if request.desired is None:
+        return None
+    t = request.desired[0]
+    return float((t[-1] - t[0]) * t.size / (t.size - 1))
+
+
+def _learner(request: LearnRequest, record: Record, begun: _Begun, axes: Sequence[str]) -> tuple[Learner, list[str]]:
+    """Return the learner of the path, with what was learned before, and remarks."""
+    desired: Mapping[str, FloatArray]
+    if request.desired is not None:
+        t, columns = request.desired
+        desired = {axis: columns[axis] for axis in axes if axis in columns}
+    elif request.learned is not None:
+        learned = request.learned["axes"]
+        desired = {axis: np.array(one["desired_m"]) for axis, one in learned.items()}
+        t = np.arange(next(iter(desired.values())).size, dtype=np.float64) * float(request.learned["interval_s"])
+    elif begun.asked is not None:
+        interval = float(np.median(np.diff(record.time_ns))) * 1e-9
+        duration = request.period or min(float(one.time_ns[-1] - one.time_ns[0]) for one in begun.asked) * 1e-9
+        size = max(2, round(duration / interval))
+        t = np.arange(size, dtype=np.float64) * (duration / size)
+        desired = _asked_at(begun, t, axes)
+    else:
+        raise UsageError(f"{record.source}: holds no desired displacements; give the path by --desired")
+    learner = Learner(request.model, t, desired, learn_limit=request.learn_limit)
+    remarks = learner.resume(request.learned) if request.learned is not None else []
+    return learner, remarks
+
+
+def _asked_at(begun: _Begun, t: FloatArray, axes: Sequence[str]) -> dict[str, FloatArray]:
+    times = begun.start_ns + np.round(1e9 * (t - t[0])).astype(np.int64)
+    sampled = at_times(begun.asked or (), times)
+    return {axis: sampled[axis] for axis in axes if axis in sampled}
+
+
+def _taken(learner: Learner, record: Record, begun: _Begun) -> list[LearnedPass]:
+    """Let the learner have one pass, if the record holds it whole; return it."""
+    t = learner.t - learner.t[0]
+    duration = float(t[-1] * t.size / (t.size - 1))
+    begin = (begun.start_ns - int(record.time_ns[0])) * 1e-9
+    if begin < -1e-6 or begin + float(t[-1]) > (int(record.time_ns[-1]) - int(record.time_ns[0])) * 1e-9 + 1e-6:
+        return []
+    measured = {axis: _at(record, record.displacement[axis], begin + t, duration / t.size) for axis in learner.axes}
+    voltage = {axis: _at(record, record.voltage[axis], begin + t, math.inf) for axis in learner.axes}
+    followed = None
+    if begun.asked is not None:
+        followed = _asked_at(begun, t, tuple(learner.axes))
+        if followed.keys() != learner.axes.keys() or not all(np.isfinite(y).all() for y in followed.values()):
+            return []
+    reports = learner.update(measured, voltage, followed=followed)
+    errors = {axis: measured[axis] - one.desired for axis, one in learner.axes.items()}
+    return [LearnedPass(record.source, begin, errors, reports)]
+
+
+def _at(record: Record, signal: FloatArray, at: FloatArray, interval: float) -> FloatArray:
+    """Return a signal, (N,), at times from the first stamp (s, (M,)); NaN in gaps."""
+    known = np.isfinite(signal)
+    order: IntArray = np.argsort(record.time_ns[known], kind="stable").astype(np.int64)
+    t = (record.time_ns[known][order] - int(record.time_ns[0])) * 1e-9
+    if not t.size:
+        return np.full(at.size, np.nan)
+    after = np.clip(np.searchsorted(t, at), 1, max(1, t.size - 1))
+    usual = max(interval, float(np.median(np.diff(t)))) if t.size > 1 else interval
+    gap = (t[np.minimum(after, t.size - 1)] - t[after - 1]) > GAP * usual
+    return np.where(gap, np.nan, np.interp(at, t, signal[known][order]))

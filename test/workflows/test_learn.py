@@ -1,0 +1,122 @@
+"""``slpi learn``: the next pass from the bags of the passes, trajectories or periods, in one go or bag by bag."""
+
+import json
+
+import numpy as np
+import pytest
+from bag_makers import JOINT_STATE, STORE, header, joint_state, rosbags_bag
+from identification.records import calibration
+
+import slpi_ros
+from slpi_ros.cli import main
+from slpi_ros.io.tables import read_table, write_table
+
+pytestmark = pytest.mark.slow
+
+RATE, PASSES, SIZE = 500.0, 4, 200
+START_NS = 10**18
+TRAJECTORY = "trajectory_msgs/msg/JointTrajectory"
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    file = tmp_path_factory.mktemp("model") / "model.json"
+    slpi_ros.save_model(slpi_ros.identify(calibration(seed=1)[0], "pi"), file)
+    return file
+
+
+def desired():
+    t = np.arange(SIZE) / RATE
+    return t, 10e-6 - 3e-6 * np.cos(2 * np.pi * np.arange(SIZE) / SIZE)
+
+
+def answered(asked, seed=0):
+    """Return the readings (m) of a stage that is late by two samples and 3 % short."""
+    late = np.concatenate([np.full(2, asked[0]), asked[:-2]])
+    return 10e-6 + 0.97 * (late - 10e-6) + np.random.default_rng(seed).normal(0.0, 3e-9, asked.size)
+
+
+def message(start_ns, path):
+    point, duration = (
+        STORE.types[name] for name in ("trajectory_msgs/msg/JointTrajectoryPoint", "builtin_interfaces/msg/Duration")
+    )
+    none, points = np.empty(0), []
+    for k, y in enumerate(path):
+        ns = round(k * 1e9 / RATE)
+        since = duration(sec=ns // 10**9, nanosec=ns % 10**9)
+        points.append(
+            point(positions=np.array([y]), velocities=none, accelerations=none, effort=none, time_from_start=since)
+        )
+    return STORE.types[TRAJECTORY](header(start_ns), joint_names=["x"], points=points)
+
+
+def bag_of(folder, path, *, trajectories=True, seed=0):
+    """Write a bag of some passes of one path, each as a trajectory or not told at all."""
+    # The trajectory ends where the next one begins.
+    path = np.append(path, path[0])
+    whole = np.concatenate([*[path[:-1]] * PASSES, path[-1:]])
+    read = answered(whole, seed)
+    stamps = START_NS + np.round(np.arange(whole.size) * 1e9 / RATE).astype(np.int64)
+    states = [
+        (int(ns), joint_state(int(ns), ("x",), (y,), (50.0,))) for ns, y in zip(stamps.tolist(), read, strict=True)
+    ]
+    assert states[0][1].__msgtype__ == JOINT_STATE
+    topics = {"/stage_state": states}
+    if trajectories:
+        starts = [int(stamps[k * SIZE]) for k in range(PASSES)]
+        topics["/desired_trajectory"] = [(ns, message(ns, path)) for ns in starts]
+    return rosbags_bag(folder, topics)
+
+
+def error_of(path):
+    """Return the true error (m) of a path that is followed for long."""
+    _, y = desired()
+    true = 10e-6 + 0.97 * (np.roll(path, 2) - 10e-6)
+    return float(np.std(true - y))
+
+
+def test_bag_by_bag_the_path_gets_better(model, tmp_path):
+    t, y = desired()
+    path, learned, nxt = y, tmp_path / "learned.json", tmp_path / "next.csv"
+    errors = [error_of(path)]
+    for round_ in range(4):
+        bag = bag_of(tmp_path / f"bag{round_}", path, seed=round_)
+        report = tmp_path / "report"
+        assert main([
+            "learn", str(bag), "--model", str(model), "--learned", str(learned), "--report", str(report), "-o", str(nxt)
+        ]) == 0  # fmt: skip
+        at, columns = read_table(nxt, "m")
+        assert np.allclose(at, t, atol=1e-6)
+        path = columns["x"]
+        errors.append(error_of(path))
+    assert errors[-1] < 0.1 * errors[0]
+    assert (report / "report.html").stat().st_size > 10_000
+    document = json.loads(learned.read_text())
+    assert len(document["axes"]["x"]["passes"]) == 4 * PASSES
+
+
+def test_passes_by_their_period_where_nothing_was_recorded_but_the_stage(model, tmp_path, capsys):
+    t, y = desired()
+    bag = bag_of(tmp_path / "bag", y, trajectories=False)
+    table = tmp_path / "desired.csv"
+    write_table(table, t, {"x": y}, "m")
+    words = ["learn", str(bag), "--model", str(model), "-o", str(tmp_path / "next.csv")]
+    assert main(words) == 2
+    assert main([*words, "--period", str(SIZE / RATE)]) == 2
+    capsys.readouterr()
+    assert main([*words, "--period", str(SIZE / RATE), "--desired", str(table), "--json"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert len(told["axes"]["x"]["passes"]) == PASSES
+    assert main([*words, "--period", "100", "--desired", str(table)]) == 1
+    assert main([*words, "--period", "-1", "--desired", str(table)]) == 2
+
+
+def test_what_is_no_document_of_this_path_is_refused(model, tmp_path):
+    t, y = desired()
+    bag, learned = bag_of(tmp_path / "bag", y), tmp_path / "learned.json"
+    words = ["learn", str(bag), "--model", str(model), "-o", str(tmp_path / "next.csv"), "--learned", str(learned)]
+    learned.write_text('{"schema": "slpi_ros/learned/1"}')
+    assert main(words) == 1
+    learned.write_text("my notes")
+    assert main(words) == 2
+    assert learned.read_text() == "my notes"

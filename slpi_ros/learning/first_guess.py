@@ -90,7 +90,7 @@ def _others(stage: AxisModel) -> Iterator[AxisModel]:
 
 
 def _changed(effect: Effect) -> Iterator[Effect]:
-    if not (effect.dynamic or getattr(effect, "modes", ())):
+    if not (effect.dynamic or hasattr(effect, "modes")):
         return
     leaves = effect.free_leaves()
     for at, leaf in enumerate(leaves):

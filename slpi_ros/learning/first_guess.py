@@ -90,11 +90,7 @@ def _others(stage: AxisModel) -> Iterator[AxisModel]:
 
 
 def _changed(effect: Effect) -> Iterator[Effect]:
-<<<<<<< HEAD
-    if not (effect.dynamic or getattr(effect, "modes", False)):
-=======
     if not (effect.dynamic or hasattr(effect, "modes")):
->>>>>>> issue48
         return
     leaves = effect.free_leaves()
     for at, leaf in enumerate(leaves):

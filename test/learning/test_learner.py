@@ -87,6 +87,7 @@ def test_a_light_mode_that_no_model_told_of_does_no_harm(model):
     assert max(errors[2:]) < 1.1 * max(errors[:2])
 
 
+@pytest.mark.long
 def test_a_thousand_passes_stay_at_the_noise_with_drift(model):
     learner, stage, _ = learned(model, 20)
     _, desired = path()

@@ -16,6 +16,7 @@ from slpi_ros.identification import fit as fits
 from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.record import Record
 from slpi_ros.nodes.jobs import FitRequest, fit
+from slpi_ros.workflows.records import Source
 
 TOPIC, START_NS = "stage_state", 1_700_000_000_000_000_000
 FloatArray = np.ndarray
@@ -243,8 +244,9 @@ def by_node(bag: str, folder: Path, delay: float) -> Decision:
 
 def by_fleet(bag: str, folder: Path) -> Decision:
     """The fleet decides on each axis by itself: a bag with an axis that is refused counts as refused."""
-    examined = examine(Bag(bag), TOPIC)
-    judged = identify_bag(examined, TOPIC, str(folder), "fleet.json")
+    reading = Source(topic=TOPIC)
+    examined = examine(Bag(bag), reading)
+    judged = identify_bag(examined, reading, str(folder), "fleet.json")
     errors = {row.axis: row.error for row in judged.rows if row.error}
     if not errors:
         return _accepted((folder / "fleet.json").read_text())

@@ -67,7 +67,7 @@ def test_every_command_node_and_the_fleet_refuse_it(coarse, model, tmp_path, cap
         assert main(command) == 1
         said.add(capsys.readouterr().err.strip().split(": ", 1)[1])
     said.add(run_diagnosis(DiagnosisRequest((bag,), "stage_state", format_model(model), folder)).error)
-    judged = compare(examine(Bag(bag), "stage_state"), "stage_state", str(tmp_path), "model.json", "new.json")
+    judged = compare(examine(Bag(bag), Source()), Source(), str(tmp_path), "model.json", "new.json")
     said |= {row.error for row in judged.rows}
     assert len(said) == 1 and not (tmp_path / "new.json").exists()
 

@@ -63,8 +63,9 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for item in items:
         if "nodes" in item.path.parent.name or "rclpy" in getattr(item.module, "__dict__", {}):
             item.add_marker("ros")
-            if repeats:
-                item.add_marker(pytest.mark.flaky(reruns=1, reruns_delay=2))
+        # Simulated devices answer over sockets within time limits, as nodes do.
+        if repeats and (item.get_closest_marker("ros") or item.path.parent.name == "drivers"):
+            item.add_marker(pytest.mark.flaky(reruns=1, reruns_delay=2))
         if "measured_data" in getattr(item, "fixturenames", ()):
             item.add_marker("measured")
     # The stream of nodes and the files with slow tests begin first; what is short fills the gaps at the end.

@@ -47,7 +47,8 @@ def _run(options: Namespace) -> Result:
     page = f"{folder / PAGE}: open it in a browser"
     warned = [line for found in done.findings for line in finding_lines(found, all_levels=False)]
     described = describe_diagnosis(diagnosis)
-    lines = [*described[: MOST_LINES - 2 - len(warned[:MOST_WARNINGS])], *warned[:MOST_WARNINGS], page]
+    first = warned[:MOST_WARNINGS]
+    lines = [*described[: MOST_LINES - 2 - len(first)], *first, page]
     if found_any or not limits:
         tested = Path(options.output) / "extended_model.json" if found_any else options.model
         next_command = f"slpi verify OTHER_BAG --model {shlex.quote(str(tested))}"

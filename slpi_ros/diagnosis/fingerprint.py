@@ -153,8 +153,8 @@ def _of_variables(records: Sequence[Signals]) -> Iterator[Left]:
             columns = columns[:, :KNOTS] - columns[:, KNOTS:]
         share, fitted = _share(columns, records)
         if share >= LEAST_SHARE:
-            advice, turns = HINTS[name], min(_turns(record).size for record in records)
-            if name == "time" and turns < FEWEST_TURNS:
+            advice = HINTS[name]
+            if name == "time" and (turns := min(_turns(record).size for record in records)) < FEWEST_TURNS:
                 advice = f"a record with {turns} turns cannot tell time from its drive: record more cycles, or {advice}"
             evidence = _evidence(name, unit, share, x, fitted, up if branches else None)
             yield Left(name, share, f"{evidence}; {advice}", _curve(x, fitted), unit)

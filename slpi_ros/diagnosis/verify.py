@@ -293,9 +293,10 @@ def verify(
     found: dict[str, list[RecordVerification]] = {name: [] for name in names}
     for record, path in zip(records, paths, strict=True):
         # Errors are those of the stage, not those of its sensor.
-        runs = _free_run(model.correct(record), model.stage_only.surrounded(record), names, (start, stop), start_memory)
+        surrounded = model.surrounded(record)
+        runs = _free_run(model.correct(record), surrounded.stage_only, names, (start, stop), start_memory)
         for name in names:
-            axis, run = model.surrounded(record).axis(name), runs[name]
+            axis, run = surrounded.axis(name), runs[name]
             one = _judge(run, axis, record.source, tolerance, without_offset=without_offset)
             if path is not None and name in path:
                 followed = path[name][np.isfinite(record.voltage[name])][: run.t.size]

@@ -66,7 +66,8 @@ class Dialect:
 
 
 DIALECTS = {
-    # piezosystem jena NV200/D: manual of the command set; `set` is the voltage in the open loop.
+    # piezosystem jena NV200/D, as public client code speaks it, not held against the manual; `set` is the voltage in
+    # the open loop.
     "nv200": Dialect(
         write="set,{voltage}",
         voltage="set",
@@ -81,7 +82,7 @@ DIALECTS = {
         error=r"error,(\d+)",
         ignored="\x00\x01\x11\x13",
     ),
-    # Thorlabs MDT693B and MDT694B: manual, chapter on the command line; an echo may be on or off.
+    # Thorlabs MDT693B and MDT694B, likewise from public client code; an echo may be on or off.
     "mdt69xb": Dialect(
         write="{channel}voltage={voltage}",
         voltage="{channel}voltage?",

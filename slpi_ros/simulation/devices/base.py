@@ -14,6 +14,8 @@ from slpi_ros.simulation.stage import Stage
 
 # Time between looks at whether a simulator shall end, seconds.
 LOOK = 0.02
+# Of a sensor with an analog output.
+VOLTS_PER_METRE = 1e5
 
 SILENT, HALF, WRONG_AXIS, ERROR, LATE, TWICE, LOST, NONSENSE, NOT_FINITE = FAULTS = (
     "silent", "half", "wrong_axis", "error", "late", "twice", "lost", "nonsense", "not_finite",

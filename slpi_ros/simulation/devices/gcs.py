@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from slpi_ros.simulation.devices.base import ERROR, HALF, NONSENSE, NOT_FINITE, TWICE, WRONG_AXIS, Fault
+from slpi_ros.simulation.devices.base import ERROR, NONSENSE, NOT_FINITE, WRONG_AXIS, Fault
 from slpi_ros.simulation.devices.gcs_waves import SimulatedWaves
 from slpi_ros.simulation.devices.stream import StreamSimulator
 from slpi_ros.simulation.stage import Stage
@@ -102,9 +102,7 @@ class GcsSimulator(StreamSimulator):
         """Return an answer as this fault leaves it."""
         first = self.axes[0].encode()
         return {
-            HALF: data[: len(data) // 2],
             WRONG_AXIS: data.replace(first + b"=", b"Z="),
-            TWICE: data + data,
             NONSENSE: b"\xff\x00<html>=1e\n" * max(data.count(b"\n"), 1),
             NOT_FINITE: first + b"=nan\n",
         }.get(fault.kind, data)

@@ -24,6 +24,7 @@ from slpi_ros.simulation.devices.base import (
     NOT_FINITE,
     SILENT,
     TWICE,
+    VOLTS_PER_METRE,
     WRONG_AXIS,
     Fault,
     SimulatedDevice,
@@ -37,8 +38,6 @@ IDENTITY, WATCHDOG = (60_000, 30), (61_600, 54)
 KNOWN_32 = (60_000, 60_004, 60_028, 61_600, 61_602, 61_604, 61_606, 61_610, 61_620, 61_640, 61_642, 61_650, 61_652)
 RANGES = {7: (0.0, 5.0), 8: (0.0, 10.0)}
 TICK_RANGE = (-10.0, 10.0)
-# Of the sensor's analog output.
-VOLTS_PER_METRE = 1e5
 READ, WRITE = 3, 16
 
 

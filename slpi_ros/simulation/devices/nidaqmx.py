@@ -24,14 +24,13 @@ from slpi_ros.simulation.devices.base import (
     NOT_FINITE,
     SILENT,
     TWICE,
+    VOLTS_PER_METRE,
     WRONG_AXIS,
     SimulatedDevice,
 )
 from slpi_ros.simulation.stage import Stage
 
 DEVICE = "Dev1"
-# Of the sensor's analog output.
-VOLTS_PER_METRE = 1e5
 # Sample clock: the stage follows the outputs at this period, as it takes long to compute.
 STAGE_NS = 1_000_000
 NAME, PRODUCT, SERIAL, RANGES = 0x1276, 0x631, 0x632, 0x299B

@@ -7,7 +7,7 @@ without an error has no answer. MDT693B of Thorlabs: three axes, no sensor, a pr
 from collections.abc import Sequence
 from typing import Any
 
-from slpi_ros.simulation.devices.base import ERROR, HALF, NONSENSE, NOT_FINITE, TWICE, WRONG_AXIS, Fault
+from slpi_ros.simulation.devices.base import ERROR, NONSENSE, NOT_FINITE, WRONG_AXIS, Fault
 from slpi_ros.simulation.devices.stream import StreamSimulator
 from slpi_ros.simulation.stage import Stage
 
@@ -57,9 +57,7 @@ class Nv200Simulator(StreamSimulator):
     def spoil(self, data: bytes, fault: Fault) -> bytes:
         """Return an answer as this fault leaves it."""
         return {
-            HALF: data[: len(data) // 2],
             WRONG_AXIS: data.replace(b"meas", b"temp"),
-            TWICE: data + data,
             NONSENSE: b"\xff<html>=1e\r\n",
         }.get(fault.kind, data)
 
@@ -132,9 +130,7 @@ class MdtSimulator(StreamSimulator):
     def spoil(self, data: bytes, fault: Fault) -> bytes:
         """Return an answer as this fault leaves it."""
         return {
-            HALF: data[: len(data) // 2],
             WRONG_AXIS: data.replace(b"xvoltage", b"zvoltage"),
-            TWICE: data + data,
             NONSENSE: b"\xff<html>=1e\r>",
         }.get(fault.kind, data)
 

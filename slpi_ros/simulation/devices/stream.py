@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from slpi_ros.errors import UsageError
-from slpi_ros.simulation.devices.base import LATE, LOOK, LOST, SILENT, Fault, SimulatedDevice
+from slpi_ros.simulation.devices.base import HALF, LATE, LOOK, LOST, SILENT, TWICE, Fault, SimulatedDevice
 
 
 class LostLinkError(Exception):
@@ -78,6 +78,10 @@ class StreamSimulator(SimulatedDevice):
             raise LostLinkError
         if fault.kind == LATE:
             self._ending.wait(fault.seconds)
+        if fault.kind == HALF:
+            return data[: len(data) // 2]
+        if fault.kind == TWICE:
+            return data + data
         return b"" if fault.kind == SILENT else self.spoil(data, fault)
 
     # Links

@@ -250,7 +250,7 @@ def _named_effects(selection: Selection) -> tuple[NamedEffect, ...]:
 
 
 def _named_effect(effect: Effect, named: Named, selection: Selection) -> NamedEffect:
-    chance = chance_of_gain(named.before, named.after, selection.trials)
+    chance = chance_of_gain(named.without, selection.now.held_out, selection.trials)
     whole, before, after = (
         held_out_error(score, own=named.own) for score in (selection.base.held_out, named.before, named.after)
     )
@@ -265,18 +265,19 @@ def _named_effect(effect: Effect, named: Named, selection: Selection) -> NamedEf
 
 
 def _evidence(effect: Effect, named: Named, chance: float, in_the_end: Score) -> str:
-    sentence = effect.describe()
-    before, after, end = (held_out_error(score, own=named.own) for score in (named.before, named.after, in_the_end))
+    before, after, without, end = (
+        length(held_out_error(score, own=named.own)) for score in (named.before, named.after, named.without, in_the_end)
+    )
     on = "records" if named.after.records.size and not named.own else "blocks"
     gained = (
-        f"with it the error on held-out {on} falls from {length(before)} to {length(after)} rms "
+        f"{effect.describe()}; with it the error on held-out {on} falls from {before} to {after} rms; "
+        f"without it {without} would be left in the end, not {end} "
         f"(p = {chance:.2g}, on blocks: the probability that chance gains as much)"
     )
     if not named.runner_up:
-        return f"{sentence}; {gained}, and no other effect comes near"
+        return f"{gained}, and no other effect comes near"
     other, rms = named.runner_up
-    instead = f"with {other} in its place {length(rms)} are left in the end, not {length(end)}"
-    return f"{sentence}; {gained}; {instead}"
+    return f"{gained}, with {other} in its place {length(rms)}"
 
 
 def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], noise_rms: float) -> str:

@@ -282,11 +282,13 @@ def alike(best: Contender, other: Contender, before: Score, *, one_speed: bool) 
 
 @dataclass(frozen=True)
 class Named:
-    """Selected effect, with the held-out errors without it and with it."""
+    """Selected effect, with the held-out errors of the preceding effects without it and with it."""
 
     name: str
     before: Score
     after: Score
+    # Held-out errors of all others, without it.
+    without: Score
     # Effects that the records do not distinguish from it; next best effect, and the held-out rms error (m) with that.
     alternatives: tuple[str, ...]
     runner_up: tuple[str, float] | None
@@ -537,8 +539,9 @@ def _named(start: Explanation, now: Explanation, rivals: Mapping[str, Sequence[E
     while left:
         scores = {name: now.only([*taken, name]).held_out if len(left) > 1 else now.held_out for name in left}
         best = min(left, key=lambda name: scores[name].rms)
-        beside = _in_its_place(best, now, rivals[best])
-        ordered.append(Named(best, before, scores[best], *beside, own=is_own(now.effect(best))))
+        rest = now.without(best)
+        beside = _in_its_place(best, now, rest, rivals[best])
+        ordered.append(Named(best, before, scores[best], rest.held_out, *beside, own=is_own(now.effect(best))))
         left.remove(best)
         taken.append(best)
         before = scores[best]
@@ -546,10 +549,10 @@ def _named(start: Explanation, now: Explanation, rivals: Mapping[str, Sequence[E
 
 
 def _in_its_place(
-    name: str, now: Explanation, rivals: Sequence[Effect]
+    name: str, now: Explanation, rest: Explanation, rivals: Sequence[Effect]
 ) -> tuple[tuple[str, ...], tuple[str, float] | None]:
-    """Return the alternatives to an effect, and its best rival with the held-out error."""
-    rest, best = now.without(name), Contender(name, now)
+    """Return the alternatives to an effect, and its best rival with the held-out error; `rest` is without it."""
+    best = Contender(name, now)
     tried = _tried(name, now, rest, rivals)
     alone = one_speed(now.evidence)
     alternatives = [other.name for other in tried if alike(best, other, rest.held_out, one_speed=alone)]

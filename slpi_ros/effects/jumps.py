@@ -1,6 +1,5 @@
 """Sudden shifts of a noisy signal that stay."""
 
-from collections.abc import Iterator
 from math import comb
 
 import numpy as np
@@ -14,9 +13,10 @@ SHORTEST, LONGEST = 16, 1 / 16
 LEAST, SEEN = 8.0, 5.0
 # Smallest and largest share of a jump that happens within a few samples; places that are tried for each jump.
 SHARP, TRIES = (0.5, 2.0), 4
-# Samples within which a jump is at a turn or a jump of the voltage; shares of the voltage range of the smallest turn
-# and of the smallest jump of one sample; probability below which it is there by more than chance.
-NEAR, TURN, LEAP, CHANCE = 8, 0.01, 0.02, 0.01
+# Samples within which a jump follows a turn or a jump of the voltage, each tried, as a stage that rings jumps late;
+# shares of the voltage range of the smallest turn and of the smallest jump of one sample; probability below which jumps
+# are there by more than chance.
+NEAR, TURN, LEAP, CHANCE = (8, 16, 32, 64), 0.01, 0.02, 0.01
 
 
 def jumps(x: FloatArray, most: int) -> list[tuple[int, float]]:
@@ -101,15 +101,15 @@ def follows_drive(places: IntArray, v: FloatArray) -> bool:
     """Return whether samples `places` are at turns or jumps of the voltage `v`, shape (N,), by more than chance."""
     span = float(np.ptp(v))
     events = np.concatenate([reversals(v, TURN * span), np.flatnonzero(np.abs(np.diff(v)) > LEAP * span) + 1])
-    mark = np.zeros(v.size + 1)
-    for begin, end in _around(events, v.size):
-        mark[begin] += 1
-        mark[end] -= 1
+    return any(_are_near(places, events, v.size, reach) for reach in NEAR)
+
+
+def _are_near(places: IntArray, events: IntArray, size: int, reach: int) -> bool:
+    """Return whether most of the `places` are within `reach` samples after `events`, by more than chance."""
+    mark = np.zeros(size + 1)
+    # A turn of a sampled voltage is known within some samples.
+    np.add.at(mark, np.maximum(events - NEAR[0], 0), 1.0)
+    np.add.at(mark, np.minimum(events + reach + 1, size), -1.0)
     near = np.cumsum(mark)[:-1] > 0
     share, count, there = float(near.mean()), places.size, int(near[places].sum())
-    return 2 * there > count and comb(count, there) * share**there < CHANCE
-
-
-def _around(events: IntArray, size: int) -> Iterator[tuple[int, int]]:
-    for event in events.tolist():
-        yield max(event - NEAR, 0), min(event + NEAR + 1, size)
+    return 2 * there > count and comb(count, there) * share**there < CHANCE / len(NEAR)

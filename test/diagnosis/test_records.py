@@ -115,14 +115,15 @@ def test_a_moved_zero_is_no_change_of_the_loops(model):
 
 
 @pytest.mark.long
-def test_a_delay_at_one_speed_stays_open_and_out_of_the_model():
+def test_a_delay_at_one_speed_stays_open_and_the_simplest_cause_is_in_the_model():
     one = record(1.5, late=0.04, seed=8)
     model = slpi_ros.identify(one)
     axis, extended = found(one, model)
-    assert axis.verdict != "named" and not axis.given.changed
-    assert not extended.effects
-    if axis.effects:
-        assert "delay" in (axis.effects[0].name, *axis.effects[0].alternatives)
+    assert axis.verdict == "ambiguous" and not axis.given.changed
+    (cause,) = axis.effects
+    assert cause.name == "delay" and cause.alternatives
+    assert [effect.name for effect in extended.effects] == ["delay"]
+    assert cause.effect.seconds == pytest.approx(0.04, rel=0.02)
 
 
 @pytest.mark.parametrize("digits", [60, pytest.param(400, marks=pytest.mark.long)])

@@ -62,6 +62,13 @@ def test_jumps_are_plausible_if_sudden_and_where_the_voltage_does_not_turn():
     assert not follows_drive(np.array([5000, 9000]), V)
 
 
+@pytest.mark.parametrize(("late", "follows"), [(5, True), (30, True), (200, False)])
+def test_jumps_that_follow_steps_of_the_voltage_late_are_of_the_drive(late, follows):
+    step, every = np.arange(4) * 1400 + 700, 1400
+    v = 10.0 * (np.arange(4 * every) % every >= 700)
+    assert follows_drive(step + late, v) == follows
+
+
 def test_a_description_tells_the_largest():
     assert "3 times" in JUMPS.describe() and "9.8765 s" in JUMPS.describe()
     assert Steps((), ()).describe() == "the zero does not jump in this record"

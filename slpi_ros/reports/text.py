@@ -17,6 +17,9 @@ from slpi_ros.model.stage_model import StageModel
 if TYPE_CHECKING:
     from slpi_ros.identification.refit import AxisChange
 
+# Noise of a sensor, rms, as a share of the displacement range, beyond which it limits what a model can promise.
+NOISY = 0.005
+
 
 def verdict(limits: Mapping[str, str], good: str = "at the sensor noise") -> str:
     """Return the verdict on all axes in one line: what limits the accuracy of each axis of `limits`, else `good`."""
@@ -42,6 +45,8 @@ def model_limits(model: StageModel) -> dict[str, str]:
         error = quality.held_out_rms if np.isfinite(quality.held_out_rms) else quality.rms
         if limit := above_noise(error, quality.floor_rms, high - low):
             limits[name] = f"{limit}, of unknown cause"
+        elif (share := quality.floor_rms / (high - low)) > NOISY:
+            limits[name] = f"the sensor, whose noise of {length(quality.floor_rms)} rms is {share:.1%} of the range"
     return limits
 
 

@@ -3,18 +3,28 @@
 from dataclasses import replace
 
 import numpy as np
+import pytest
 
 from slpi_ros.effects.hum import Hum, Line
 from slpi_ros.effects.lag import Lag
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
-from slpi_ros.reports.text import describe_axis
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.reports.text import describe_axis, model_limits
+
+SHAPE = PrandtlIshlinskii(np.array([0.0, 1.0]), np.array([1e-7, 1e-7]))
+
+
+@pytest.mark.parametrize(("noise", "error", "limited"), [(1e-9, 1e-9, False), (2e-8, 2e-8, True), (1e-9, 1e-8, True)])
+def test_a_model_is_limited_by_its_error_or_by_a_noisy_sensor(noise, error, limited):
+    quality = FitQuality(error, 2e-9, error, noise, 3, 0.1, "test")
+    axis = AxisModel("pi", SHAPE, Start(0.0, 0.0), (0.0, 1.0), (0.0, 1e-6), quality)
+    assert set(model_limits(StageModel({"x": axis}))) == ({"x"} if limited else set())
 
 
 def test_effects_are_told_one_by_one():
-    shape = PrandtlIshlinskii(np.array([0.0, 1.0]), np.array([1e-7, 1e-7]))
     quality = FitQuality(1e-9, 2e-9, 3e-9, 0.0, 3, 0.1, "test")
-    axis = AxisModel("pi", shape, Start(0.0, 0.0), (0.0, 1.0), (0.0, 1e-6), quality)
+    axis = AxisModel("pi", SHAPE, Start(0.0, 0.0), (0.0, 1.0), (0.0, 1e-6), quality)
     assert describe_axis(axis)[-1] == "effects: none"
     lag, hum = Lag(0.015), Hum((Line(50.0, 20e-9, 0.0),))
     *_, before, one, other = describe_axis(replace(axis, effects=(hum, lag)))

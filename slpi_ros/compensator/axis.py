@@ -80,6 +80,7 @@ class Axis:
         # Time (s) for which ticks have moved the effects on since the last sample.
         self._ticked = 0.0
         self._in_block = False  # a device moves the axis by itself
+        self._replaced = False  # a new model, for which the voltage of the last sample is not known yet
         # Setpoint and displacement of the model as a sensor with delay or lag tells them; None without these.
         self._setpoint: Sensed | None = None
         self._expected: Sensed | None = None
@@ -168,6 +169,7 @@ class Axis:
         self._sensor_watch.span, self._sensor_watch.noise = high - low, model.quality.floor_rms
         self._sensor = model.streaming_sensor()
         self._setpoint = Sensed(self._sensor, stream.uncoupled_displacement) if self._sensor.late else None
+        self._replaced = True
         if self._feedback:
             self._applied = continue_from(model, allowed, self._applied)
             self._forget_residuals()
@@ -285,7 +287,7 @@ class Axis:
         else:
             self.held = self.slewing = False
         self.given_ns = now_ns
-        self.start_memory = None
+        self.start_memory, self._replaced = None, False
         self.amplifier.output(v, now_ns)
         if self._setpoint:
             self._setpoint.hold(y, now_ns)
@@ -336,17 +338,16 @@ class Axis:
 
     def _approach(self, now_ns: int) -> None:
         """Go on towards the voltage of the last sample."""
-        dt = self._passed(now_ns)
-        stream, feedback = self.stream, self._feedback
-        if feedback is None:
-            v = stream.approach(dt, now_ns)
+        dt, desired, (low, high) = self._passed(now_ns), self.tracking.desired, self.stream.accepted
+        if self._replaced and desired is not None and low <= desired <= high:
+            self._sample(dt, desired, now_ns)
         else:
-            desired = self.tracking.desired
-            v = stream.approach(dt, now_ns)
-            v = self._correct(dt, stream.desired if desired is None else desired, v, now_ns)
-        self.slewing = stream.missed and not stream.held
-        self.held = stream.held
-        self.amplifier.output(v, now_ns)
+            v = self.stream.approach(dt, now_ns)
+            if self._feedback is not None:
+                v = self._correct(dt, self.stream.desired if desired is None else desired, v, now_ns)
+            self.slewing = self.stream.missed and not self.stream.held
+            self.held = self.stream.held
+            self.amplifier.output(v, now_ns)
         self.due_ns = now_ns + self._period_ns
         if not (self.slewing or self.in_motion):
             self.due_ns = now_ns + SOONEST_HOLD_NS if self.holds else None

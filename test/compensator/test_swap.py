@@ -11,6 +11,7 @@ from strategies import FAMILY_CASE, axis_model, axis_models, cases_and_paths, st
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import OPEN_LOOP
 from slpi_ros.compensator.model_swap import take_over, turning_voltages
+from slpi_ros.effects.lag import Lag
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.hysteresis.shapes import FAR
 from slpi_ros.model.limits import Limits
@@ -86,6 +87,29 @@ def test_a_running_axis_takes_no_model_that_would_extrapolate_far(present, taken
         return
     with pytest.raises(UsageError, match=rf"{present:g} V.*\b0\.\.100 V"):
         axis.prepare(AXIS)
+
+
+@pytest.mark.parametrize("effects", [(), (Lag(2e-3),)])
+def test_a_sample_that_the_slew_limit_holds_back_is_reached_with_a_new_model(effects):
+    limits = Limits(0.0, 100.0, 100.0)
+    stiff = replace(AXIS, effects=effects)
+    own = AXIS.hysteresis
+    soft = replace(stiff, hysteresis=replace(own, everett=0.8 * own.everett, rise=0.8 * own.rise))
+    axis = Axis("x", 0, limits, OPEN_LOOP)
+    axis.use(stiff, axis.prepare(stiff))
+    now = 1_000_000_000
+    desired = AXIS.displacement_range[0] + 0.7 * float(np.ptp(AXIS.displacement_range))
+    axis.update(None, desired, now)
+    assert axis.slewing
+    way = [axis.voltage]
+    for step in range(2000):
+        now += 1_000_000
+        if step == 100:
+            axis.use(soft, axis.prepare(soft))
+        axis.tick(now)
+        way.append(axis.voltage)
+    assert np.abs(np.diff(way)).max() <= 0.1 + 1e-9
+    assert axis.stream.uncoupled_displacement == pytest.approx(desired, abs=1e-3 * np.ptp(AXIS.displacement_range))
 
 
 def test_without_a_past_the_model_starts_where_it_says():

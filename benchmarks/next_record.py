@@ -172,7 +172,7 @@ def advised_drive(next_experiment: str, *options: str) -> tuple[str, FloatArray,
 
     The drive is its times (s) and voltages (V) by axis, shape (N,) each; there are none where nothing is recommended.
     """
-    command = re.search(r"`slpi (excite .*?)`", next_experiment)
+    command = re.search(r"`slpi (excite -o .*?)`", next_experiment)
     if not command:
         return "", np.empty(0), {}
     words = shlex.split(command[1])

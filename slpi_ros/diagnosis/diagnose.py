@@ -34,6 +34,9 @@ REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
 # Effects that leave more than noise are part of the model if they leave at most this share of the error (a third of its
 # mean square), and if the free run of the extended model shows this share of the held-out gain.
 LEFT_OF_ERROR, GAIN_SHOWN = 0.6, 0.5
+# A drift, which may have any course, or a cause with alternatives may stand for a wrong hysteresis: if they leave more
+# than this multiple of the repeatability, at most this share of the error (a tenth of its mean square).
+MUCH_LEFT, LEFT_BY_UNSURE = 3.0, 0.316
 # Gauss-Newton steps of the selected effects with the hysteresis of the given model, which has more vertices; largest
 # ratio of the error of the coarser one to that with it.
 REFINED, COARSER = 3, 1.05
@@ -214,15 +217,15 @@ def _extension(model: AxisModel, selection: Selection, given: Given, source: str
 
 def _of_another_kind(selection: Selection) -> bool:
     """Return whether the effects leave so much that the physics is another, where they would not carry over."""
+    unsure = any(EFFECTS[named.name].free_course or named.alternatives for named in selection.named)
+    if unsure and _more_than_noise(selection, MUCH_LEFT):
+        return _share_left(selection) > LEFT_BY_UNSURE
     return _more_than_noise(selection) and _share_left(selection) > LEFT_OF_ERROR
 
 
-def _more_than_noise(selection: Selection) -> bool:
-    """Return whether there are effects, and they leave more than what does not repeat."""
-    return (
-        bool(selection.named)
-        and selection.now.held_out.rms_of_records > ABOVE_NOISE * _repeatability(selection.now).rms
-    )
+def _more_than_noise(selection: Selection, times: float = ABOVE_NOISE) -> bool:
+    """Return whether there are effects, and they leave more than so many `times` what does not repeat."""
+    return bool(selection.named) and selection.now.held_out.rms_of_records > times * _repeatability(selection.now).rms
 
 
 def _share_left(selection: Selection) -> float:

@@ -221,6 +221,8 @@ class EffectBase(Protocol):
     dynamic: ClassVar[bool] = False
     # Whether a change of the sensitivity between records may be its doing.
     changes_gain: ClassVar[bool] = False
+    # Whether it is a course of time that nothing else determines, which may also stand for what changes with the drive.
+    free_course: ClassVar[bool] = False
     # Whether it follows recorded quantities.
     follows_quantities: ClassVar[bool] = False
     # Effects that follow time alone: it counts only beside its `confounders`, which they contain, and then they are no

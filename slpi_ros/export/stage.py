@@ -9,7 +9,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
+from slpi_ros.effects.base import Followed
 from slpi_ros.effects.paths import Laws
+from slpi_ros.effects.surroundings import Surroundings
 from slpi_ros.errors import UsageError
 from slpi_ros.hysteresis.kinds import DESCRIPTIONS, PathModel
 from slpi_ros.hysteresis.loop_family import LoopFamily
@@ -68,7 +70,7 @@ class ExportedAxis:
                 known = bool(effect.shift) or effect.passes != (-inf, inf) or effect.acts_on == "voltage"
             else:
                 laws = effect.laws()
-                known = laws is not None and laws.keys() <= set(Known._fields)
+                known = isinstance(effect, Surroundings) or (bool(laws) and set(laws or {}) <= set(Known._fields))
             refused += [] if known else [effect.name]
         refused += [effect.name for effect in chain.shared if not effect.coupling]
         if refused:
@@ -82,6 +84,11 @@ class ExportedAxis:
             if effect.streaming() is not None:
                 found |= effect.laws() or {}
         return Laws(**found)
+
+    @property
+    def surroundings(self) -> Surroundings | None:
+        """The recorded quantities that it follows, and how."""
+        return next((effect for effect in self.model.chain.own if isinstance(effect, Surroundings)), None)
 
     @cached_property
     def memory(self) -> Memory:
@@ -210,6 +217,15 @@ class ExportedStage:
         """Return the causal compensator that the exported inverse equals."""
         streams = {axis.name: axis.model.stream(axis.limits) for axis in self.axes}
         return StageStream(streams, self.model.coupling, self.model.origins)
+
+    @cached_property
+    def quantities(self) -> tuple[Followed, ...]:
+        """Recorded quantities that any axis follows, by their numbers."""
+        found = dict[str, Followed]()
+        for axis in self.axes:
+            for one in axis.surroundings.followed if axis.surroundings else ():
+                found.setdefault(one.key, one)
+        return tuple(found.values())
 
     @cached_property
     def gains(self) -> FloatArray:

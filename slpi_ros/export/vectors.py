@@ -27,12 +27,16 @@ DOUBLE, FLOAT, FLOAT_SLOW, RINGING = 1e-12, 1e-5, 1e-4, 10.0
 
 @dataclass(frozen=True)
 class Vectors:
-    """Steps: times (s, (N,)), displacements (m, (N, axes)), expected voltages (V, (N, axes)), and codes (N,)."""
+    """Steps: times (s, (N,)), displacements (m, (N, axes)), expected voltages (V, (N, axes)), and codes (N,).
+
+    `surroundings` are values of the quantities that the stage follows, (N, quantities), NaN where none comes.
+    """
 
     dt: FloatArray
     desired: FloatArray
     volts: FloatArray
     codes: NDArray[np.int64]
+    surroundings: FloatArray
 
 
 def code_of(error: SlpiError) -> int:
@@ -99,18 +103,40 @@ def _displacements(span: tuple[float, float], steps: int, rng: np.random.Generat
     return low + (high - low) * np.concatenate(parts)[:steps]
 
 
+def courses(stage: ExportedStage, steps: int, seed: int = 1) -> FloatArray:
+    """Return values of the quantities that a stage follows, shape (N, quantities); NaN in steps where none comes."""
+    rng = np.random.default_rng(seed)
+    values = np.full((steps, len(stage.quantities)), nan)
+    for column, one in zip(values.T, stage.quantities, strict=True):
+        # The first steps are at the reference.
+        comes = rng.integers(steps // 8, steps, max(steps // 40, 1))
+        column[comes] = rng.uniform(one.lowest, one.highest, comes.size)
+    return values
+
+
+def surround(stream: StageStream, stage: ExportedStage, values: FloatArray) -> None:
+    """Give the stream values of quantities, shape (quantities,); NaN: none comes."""
+    known = {one.key: value for one, value in zip(stage.quantities, values.tolist(), strict=True) if value == value}
+    for each in stream.streams.values():
+        each.surround(known)
+
+
 def vectors(stage: ExportedStage, steps: int = STEPS, seed: int = 1) -> Vectors:
     """Return steps with the answers of the stream, and among them some that it refuses."""
     stamps, desired = path(stage, steps, seed)
     rng = np.random.default_rng(seed)
     stream, names = stage.stream(), [axis.name for axis in stage.axes]
     before, rows = 0.0, list[tuple[float, list[float], list[float], int]]()
+    given, coming = list[FloatArray](), courses(stage, steps, seed)
     refused = set(rng.integers(2, steps, 12).tolist())
     for k, (stamp, y) in enumerate(zip((stamps * 1e-9).tolist(), desired.tolist(), strict=True)):
+        surround(stream, stage, coming[k])
+        given.append(coming[k])
         if k in refused:
             low, high = stage.axes[-1].accepted
             for dt, wrong in ((0.0, nan), (0.0, high + (high - low)), (-1e-3, y[-1]), (nan, y[-1])):
                 rows.append(_answered(stream, names, before, dt, [*y[:-1], wrong]))
+                given.append(coming[k])
         try:
             rows.append(_answered(stream, names, before, stamp - before, y, stamp))
         except SlpiError:
@@ -118,7 +144,8 @@ def vectors(stage: ExportedStage, steps: int = STEPS, seed: int = 1) -> Vectors:
             break
         before = stamp
     times, wanted, volts, codes = zip(*rows, strict=True)
-    return Vectors(np.array(times), np.array(wanted), np.array(volts), np.array(codes, dtype=np.int64))
+    kinds = np.array(codes, dtype=np.int64)
+    return Vectors(np.array(times), np.array(wanted), np.array(volts), kinds, np.array(given[: len(rows)]))
 
 
 def _answered(
@@ -148,9 +175,12 @@ def program_files(stage: ExportedStage, steps: int = STEPS) -> dict[str, str]:
             "desired": [constant(one) for one in y],
             "volts": [constant(v) for v in volts],
             "code": code,
+            "surroundings": [constant(one) for one in values],
         }
-        for dt, y, volts, code in zip(
-            *(found.dt.tolist(), found.desired.tolist(), found.volts.tolist(), found.codes.tolist()), strict=True
+        for dt, y, volts, code, values in zip(
+            *(found.dt.tolist(), found.desired.tolist(), found.volts.tolist(), found.codes.tolist()),
+            *(found.surroundings.tolist(),),
+            strict=True,
         )
     ]
     ranges = [repr(axis.allowed.upper - axis.allowed.lower) for axis in stage.axes]

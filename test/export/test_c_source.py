@@ -1,5 +1,6 @@
 """The exported C source answers what the stream of Python answers."""
 
+import ctypes
 import subprocess
 import tempfile
 from dataclasses import replace
@@ -15,9 +16,10 @@ from hypothesis import strategies as st
 
 from slpi_ros.effects.hum import Hum, Line
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
+from slpi_ros.effects.surroundings import Quantity, Surroundings
 from slpi_ros.errors import UsageError
 from slpi_ros.export.stage import ExportedStage
-from slpi_ros.export.vectors import UNREACHABLE, path, program_files, vectors
+from slpi_ros.export.vectors import UNREACHABLE, courses, path, program_files, vectors
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled, MultiSlope
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop
@@ -36,8 +38,9 @@ def widths(stage):
 def differences(stage, folder, stamps, y, *flags, name="gcc"):
     """Return the largest difference by axis, as a share of the voltage range, up to what the model cannot reach."""
     t = stamps * 1e-9
-    v, code = by_python(stage, t, y)
-    answers, codes = build(folder, stage, *flags, name=name).run(np.diff(t, prepend=0.0), y)
+    given = courses(stage, t.size)
+    v, code = by_python(stage, t, y, given)
+    answers, codes = build(folder, stage, *flags, name=name).run(np.diff(t, prepend=0.0), y, given)
     end = int(np.argmax(code == UNREACHABLE)) if (code == UNREACHABLE).any() else code.size
     assert np.array_equal(code[:end], codes[:end])
     return np.abs(v - answers)[:end].max(axis=0, initial=0.0) / widths(stage)
@@ -91,7 +94,7 @@ def test_refused_steps_change_nothing_and_their_time_counts(tmp_path):
     stage = ExportedStage.of(two_axes(), FREE)
     found = vectors(stage, 400)
     assert {1, 2, 3} <= set(found.codes.tolist())
-    answers, codes = build(tmp_path, stage).run(found.dt, found.desired)
+    answers, codes = build(tmp_path, stage).run(found.dt, found.desired, found.surroundings)
     assert np.array_equal(codes, found.codes)
     assert (np.abs(answers - found.volts).max(axis=0) <= AGREES * widths(stage)).all()
 
@@ -143,6 +146,32 @@ def test_a_voltage_that_is_applied_moves_the_model(tmp_path):
         moved = {name: y - origins[name] for name, y in own.items()}
         expected = [own["x"] + 0.03 * moved["y"], own["y"] - 0.02 * moved["x"]]
         assert np.abs(one.drive(dt, volts) - expected).max() < 1e-17
+
+
+def test_quantities_that_do_not_come_or_make_no_sense_are_ignored(tmp_path):
+    stage = ExportedStage.of(one_axis("slpi", EVERY), FREE)
+    assert [one.key for one in stage.quantities] == ["/room/temperature", "/load:force.z"]
+    one = build(tmp_path, stage)
+    setting = one.library.slpi_inverse_set
+    setting.argtypes = [ctypes.c_char_p, ctypes.c_int, ctypes.c_double]
+    before = one.state.raw
+    for number, value, code in ((0, np.nan, 2), (1, np.inf, 2), (-1, 1.0, 3), (2, 1.0, 3)):
+        assert setting(one.state, number, value) == code
+    assert one.state.raw == before
+    assert setting(one.state, 1, 5.0) == 0 and one.state.raw != before
+
+
+def test_an_arithmetic_that_failed_leaves_the_quantities(tmp_path):
+    follows = Surroundings((Quantity("/room", offset_gain=1e6), Quantity("/load", offset_gain=-2e-8)))
+    stage = ExportedStage.of(one_axis("slpi", (follows,)), FREE)
+    one = build(tmp_path, stage)
+    low, high = stage.axes[0].model.displacement_range
+    y = np.full((3, 1), 0.5 * (low + high))
+    given = np.array([[1e-12, 4.0], [1e308, np.nan], [1e-12, np.nan]])
+    answers, codes = one.run(np.full(3, 1e-3), y, given)
+    assert codes.tolist() == [0, 5, 0] and answers[1] == answers[0]
+    # The load is known as before.
+    assert answers[2] == pytest.approx(answers[0], abs=1e-9)
 
 
 def nested(turns, rng):

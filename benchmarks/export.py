@@ -259,8 +259,9 @@ def agreement(models, steps, folder, rng):
         t, y = smooth(one, 20_000)
         double, codes, _ = compiled.run(np.diff(t, prepend=0.0), y)
         single, _, _ = Compiled(own, one, "-DSLPI_FLOAT").run(np.diff(t, prepend=0.0), y)
+        rounded, _, _ = compiled.run(np.diff(t, prepend=0.0), y.astype(np.float32))
         group = GROUPS[min(len(set(names) - set(SMOOTH)), 2)]
-        floats[group].append(largest(one, single, double, codes))
+        floats[group].append([largest(one, each, double, codes) for each in (single, rounded)])
         if sys.stderr.isatty():
             print(f"\r{k + 1} of {models}", end="", file=sys.stderr)
     print(
@@ -270,8 +271,11 @@ def agreement(models, steps, folder, rng):
     print(f"  {sum(error == 0.0 for error in errors)} of {models} models to the last bit; allowed 1e-12")
     for group, found in floats.items():
         if found:
-            spread = f"median {np.median(found):.2g}, largest {max(found):.2g}"
-            print(f"float on smooth paths, {group}: {spread} ({len(found)} models)")
+            (all_, least), (most, least_most) = np.median(found, axis=0), np.max(found, axis=0)
+            print(
+                f"float on smooth paths, {group}: median {all_:.2g}, largest {most:.2g}; of it double with setpoints "
+                f"rounded to float {least:.2g}, {least_most:.2g} ({len(found)} models)"
+            )
     print(f"state of an axis, 64 turning points: median {np.median(sizes):.0f}, largest {max(sizes):.0f} bytes")
 
 

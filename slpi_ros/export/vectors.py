@@ -19,10 +19,15 @@ OK, BAD_TIME, NOT_FINITE, OUT_OF_RANGE, UNREACHABLE = range(5)
 STEPS, USUAL = 1200, 1e-4
 # Stored displacements of each mode, and how many more a step needs.
 HISTORY = 128
-# Largest difference to the stream of Python, as a share of the voltage range: double; float; float with states that
-# hardly change in a step, or with the logarithm of a small step. The inverse of a mode multiplies what rounding leaves,
-# that of a lag by its time constant over the step.
-DOUBLE, FLOAT, FLOAT_SLOW, RINGING = 1e-12, 1e-5, 1e-4, 10.0
+# Largest difference to the stream of Python, as a share of the voltage range: double; float; float with creep, whose
+# states hardly change in a step. The inverses of lag, rate law and modes multiply rounding errors, and a model without
+# slope jumps: allowed is what setpoints make that are rounded so many times as coarsely as float does.
+DOUBLE, FLOAT, FLOAT_SLOW, COARSER = 1e-12, 1e-5, 1e-4, 64.0
+# Share of the steps in which a model that jumps at turns may differ by more: with float, a jump comes a step earlier or
+# later.
+STRAY = 0.02
+# Rounding of a float, as a share of the number.
+EPSILON = 2.0**-24
 
 
 @dataclass(frozen=True)
@@ -55,13 +60,59 @@ def usual_step(stage: ExportedStage) -> float:
     return max(USUAL, round(1e9 * 4.0 / ((HISTORY - 4) * lowest)) * 1e-9)
 
 
-def float_limit(stage: ExportedStage) -> float:
-    """Return the largest difference of the float build on the vectors, as a share of the voltage range."""
-    found = FLOAT
-    for laws in (axis.laws for axis in stage.axes):
-        own = FLOAT_SLOW if laws.relaxations.size or laws.rate.size else FLOAT
-        found = max(found, own * (1.0 + laws.lag / usual_step(stage)) * (RINGING if laws.modes.size else 1.0))
-    return found
+def float_goal(stage: ExportedStage) -> float:
+    """Return the largest difference that `float` should make, as a share of the voltage range."""
+    return FLOAT_SLOW if any(axis.laws.relaxations.size for axis in stage.axes) else FLOAT
+
+
+def by_rounding(stage: ExportedStage, steps: int = STEPS, seed: int = 1, coarser: float = 1.0) -> float:
+    """Return the largest change of the voltages, as a share of their range, by setpoints rounded to `float`.
+
+    Everything is computed with `double`: a build with `float` can do no better. `coarser`: by what factor the rounding
+    is coarser than that of `float`.
+    """
+    stamps, desired = path(stage, steps, seed)
+    given, names = courses(stage, steps, seed), [axis.name for axis in stage.axes]
+    ranges = [axis.allowed.upper - axis.allowed.lower for axis in stage.axes]
+    exact, rounded, most = stage.stream(), stage.stream(), 0.0
+    signals = (desired, _rounded(desired, coarser), given, _rounded(given, coarser))
+    for stamp, *values in zip((stamps * 1e-9).tolist(), *signals, strict=True):
+        voltages = []
+        for stream, y, known in ((exact, *values[::2]), (rounded, *values[1::2])):
+            surround(stream, stage, known)
+            try:
+                voltages.append(stream.step(stamp, dict(zip(names, y.tolist(), strict=True))))
+            except SlpiError:
+                # Beyond the model.
+                return most
+        changes = zip(*(one.values() for one in voltages), ranges, strict=True)
+        most = max(most, *(abs(one - other) / span for one, other, span in changes))
+    return most
+
+
+def _rounded(values: FloatArray, coarser: float) -> FloatArray:
+    """Return values on a grid, as `float` has it for the largest ones of a column, times `coarser`."""
+    largest = np.nanmax(np.abs(values), axis=0, initial=0.0)
+    grid = 2.0 * EPSILON * coarser * np.where(largest > 0.0, largest, 1.0)
+    return np.round(values / grid) * grid
+
+
+def _jumps(stage: ExportedStage) -> bool:
+    """Return whether a branch of an axis has pieces without slope, over which the voltage jumps."""
+    return any(axis.branches.operators.size for axis in stage.axes)
+
+
+def float_remarks(stage: ExportedStage) -> list[str]:
+    """Return a remark where `float` is not enough for the model, else nothing."""
+    if _jumps(stage):
+        return ["with float, jumps of a model of kind 'mpi' at turns may come a step earlier or later; use double"]
+    rounding = by_rounding(stage)
+    if rounding <= float_goal(stage):
+        return []
+    return [
+        f"with float, rounding of the setpoints alone moves the voltages by up to {rounding:.1g} of their range on the "
+        "steps of slpi_test.c; use double"
+    ]
 
 
 def path(stage: ExportedStage, steps: int, seed: int = 1) -> tuple[NDArray[np.int64], FloatArray]:
@@ -184,7 +235,9 @@ def program_files(stage: ExportedStage, steps: int = STEPS) -> dict[str, str]:
         )
     ]
     ranges = [repr(axis.allowed.upper - axis.allowed.lower) for axis in stage.axes]
-    limits = {"double_limit": repr(DOUBLE), "float_limit": repr(float_limit(stage))}
+    allowed = max(float_goal(stage), by_rounding(stage, steps, coarser=COARSER))
+    limits = {"double_limit": repr(DOUBLE), "float_limit": f"{allowed:.3g}", "coarser": f"{COARSER:g}"}
+    limits["strays"] = str(round(STRAY * len(rows)) if _jumps(stage) else 0)
     more: dict[str, Any] = {"rows": rows, "ranges": ranges, **limits}
     context = {**context_of(stage), **more}
     return {"slpi_test.c": templates().get_template("slpi_test.c.j2").render(context)}

@@ -15,11 +15,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slpi_ros.effects.hum import Hum, Line
+from slpi_ros.effects.lag import Lag
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.effects.surroundings import Quantity, Surroundings
 from slpi_ros.errors import UsageError
 from slpi_ros.export.stage import ExportedStage
-from slpi_ros.export.vectors import UNREACHABLE, courses, path, program_files, vectors
+from slpi_ros.export.vectors import UNREACHABLE, by_rounding, courses, float_remarks, path, program_files, vectors
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled, MultiSlope
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop
@@ -88,6 +89,17 @@ def test_the_written_program_passes(tmp_path, flags):
     (tmp_path / "slpi_inverse.c").write_text(wrong)
     assert not subprocess.run(command, cwd=tmp_path, capture_output=True).returncode
     assert subprocess.run([tmp_path / "slpi_test"], capture_output=True).returncode == 1
+
+
+def test_what_rounding_of_setpoints_makes_is_measured():
+    plain = ExportedStage.of(one_axis("slpi"), FREE)
+    assert 0.0 < by_rounding(plain, 300) < 1e-6 and float_remarks(plain) == []
+    # A lag of 200 steps multiplies it.
+    late = ExportedStage.of(one_axis("slpi", (Lag(0.02),)), FREE)
+    assert by_rounding(late, 300) > 30.0 * by_rounding(plain, 300)
+    (told,) = float_remarks(late)
+    assert "use double" in told
+    assert "mpi" in float_remarks(ExportedStage.of(one_axis("mpi"), FREE))[0]
 
 
 def test_refused_steps_change_nothing_and_their_time_counts(tmp_path):

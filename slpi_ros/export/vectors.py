@@ -65,14 +65,24 @@ def float_goal(stage: ExportedStage) -> float:
     return FLOAT_SLOW if any(axis.laws.relaxations.size for axis in stage.axes) else FLOAT
 
 
-def by_rounding(stage: ExportedStage, steps: int = STEPS, seed: int = 1, coarser: float = 1.0) -> float:
+def smooth(stage: ExportedStage, steps: int) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return stamps (ns, (N,)) and displacements (m, (N, axes)) of a smooth path within the limits."""
+    place = np.arange(steps)
+    shares = 0.5 + 0.3 * np.sin(2.0 * pi * place / 600.0) + 0.1 * np.sin(2.0 * pi * place / 130.0)
+    low, high = np.array([axis.model.displacement_range for axis in stage.axes]).T
+    return round(usual_step(stage) * 1e9) * place, low + np.outer(shares, high - low)
+
+
+def by_rounding(
+    stage: ExportedStage, stamps: NDArray[np.int64], desired: FloatArray, given: FloatArray, coarser: float = 1.0
+) -> float:
     """Return the largest change of the voltages, as a share of their range, by setpoints rounded to `float`.
 
-    Everything is computed with `double`: a build with `float` can do no better. `coarser`: by what factor the rounding
-    is coarser than that of `float`.
+    Stamps (ns, (N,)) and displacements (m, (N, axes)) are those of `path` or `smooth`, values of quantities (N, K) those
+    of `courses`. Everything is computed with `double`: a build with `float` can do no better. `coarser`: by what factor
+    the rounding is coarser than that of `float`.
     """
-    stamps, desired = path(stage, steps, seed)
-    given, names = courses(stage, steps, seed), [axis.name for axis in stage.axes]
+    names = [axis.name for axis in stage.axes]
     ranges = [axis.allowed.upper - axis.allowed.lower for axis in stage.axes]
     exact, rounded, most = stage.stream(), stage.stream(), 0.0
     signals = (desired, _rounded(desired, coarser), given, _rounded(given, coarser))
@@ -106,12 +116,12 @@ def float_remarks(stage: ExportedStage) -> list[str]:
     """Return a remark where `float` is not enough for the model, else nothing."""
     if _jumps(stage):
         return ["with float, jumps of a model of kind 'mpi' at turns may come a step earlier or later; use double"]
-    rounding = by_rounding(stage)
+    rounding = by_rounding(stage, *smooth(stage, STEPS // 2), courses(stage, STEPS // 2))
     if rounding <= float_goal(stage):
         return []
     return [
-        f"with float, rounding of the setpoints alone moves the voltages by up to {rounding:.1g} of their range on the "
-        "steps of slpi_test.c; use double"
+        f"with float, rounding of the setpoints alone moves the voltages by up to {rounding:.1g} of their range on a "
+        f"smooth path with steps of {usual_step(stage):g} s; use double"
     ]
 
 
@@ -235,7 +245,7 @@ def program_files(stage: ExportedStage, steps: int = STEPS) -> dict[str, str]:
         )
     ]
     ranges = [repr(axis.allowed.upper - axis.allowed.lower) for axis in stage.axes]
-    allowed = max(float_goal(stage), by_rounding(stage, steps, coarser=COARSER))
+    allowed = max(float_goal(stage), by_rounding(stage, *path(stage, steps), courses(stage, steps), COARSER))
     limits = {"double_limit": repr(DOUBLE), "float_limit": f"{allowed:.3g}", "coarser": f"{COARSER:g}"}
     limits["strays"] = str(round(STRAY * len(rows)) if _jumps(stage) else 0)
     more: dict[str, Any] = {"rows": rows, "ranges": ranges, **limits}

@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from dataclasses import replace
+from functools import partial
 from math import inf
 from pathlib import Path
 
@@ -249,7 +250,8 @@ def agreement(models, steps, folder, rng):
         own = folder / str(k)
         own.mkdir()
         stamps, y = path(one, each, seed=k)
-        compiled = Compiled(own, one)
+        # The compiler takes longer than the steps.
+        compiled = Compiled(own, one, "-O0")
         given = courses(one, each, seed=k)
         expected, codes, _ = streamed(one, stamps * 1e-9, y, given)
         answers, _, _ = compiled.run(np.diff(stamps * 1e-9, prepend=0.0), y, given)
@@ -258,12 +260,12 @@ def agreement(models, steps, folder, rng):
         sizes.append(compiled.size / len(one.axes))
         t, y = smooth(one, 20_000)
         double, codes, _ = compiled.run(np.diff(t, prepend=0.0), y)
-        single, _, _ = Compiled(own, one, "-DSLPI_FLOAT").run(np.diff(t, prepend=0.0), y)
+        single, _, _ = Compiled(own, one, "-O0", "-DSLPI_FLOAT").run(np.diff(t, prepend=0.0), y)
         rounded, _, _ = compiled.run(np.diff(t, prepend=0.0), y.astype(np.float32))
         group = GROUPS[min(len(set(names) - set(SMOOTH)), 2)]
         floats[group].append([largest(one, each, double, codes) for each in (single, rounded)])
-        if sys.stderr.isatty():
-            print(f"\r{k + 1} of {models}", end="", file=sys.stderr)
+        if (k + 1) % 10 == 0:
+            print(f"{k + 1} of {models} models, {compared} steps: {max(errors):.3g}", file=sys.stderr, flush=True)
     print(
         f"agreement, double: {compared} of {models} x {each} steps (the others come after one that a model does not "
         f"reach), largest difference {max(errors):.3g} of the voltage range"
@@ -347,14 +349,18 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=1_000_000, help="steps of all models; default: 1e6")
     parser.add_argument("--models", type=int, default=200)
+    parser.add_argument("--only", choices=("times", "worst", "stack", "agreement"), help="one part; default: all")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     rng = np.random.default_rng(options.seed)
     with tempfile.TemporaryDirectory() as folder:
-        durations(Path(folder), rng)
-        worst(Path(folder), rng)
-        beyond(Path(folder), rng)
-        agreement(options.models, options.steps, Path(folder), rng)
+        parts = {
+            "times": durations, "worst": worst, "stack": beyond,
+            "agreement": partial(agreement, options.models, options.steps),
+        }  # fmt: skip
+        for name, part in parts.items():
+            if options.only in (None, name):
+                part(Path(folder), rng)
 
 
 if __name__ == "__main__":

@@ -78,8 +78,8 @@ def by_rounding(
 ) -> float:
     """Return the largest change of the voltages, as a share of their range, by setpoints rounded to `float`.
 
-    Stamps (ns, (N,)) and displacements (m, (N, axes)) are those of `path` or `smooth`, values of quantities (N, K) those
-    of `courses`. Everything is computed with `double`: a build with `float` can do no better. `coarser`: by what factor
+    Stamps (ns, (N,)) and displacements (m, (N, axes)) are those of `path` or `smooth`, quantities (N, K) those of
+    `courses`. Everything is computed with `double`: a build with `float` can do no better. `coarser`: by what factor
     the rounding is coarser than that of `float`.
     """
     names = [axis.name for axis in stage.axes]

@@ -233,7 +233,7 @@ def run_hostile(folder, stage, steps, *flags, name="gcc"):
     }  # fmt: skip
     given = [f"-D{key}={{{', '.join(map(repr, map(float, each)))}}}" for key, each in values.items()]
     source = Path(__file__).with_name("hostile.c")
-    command = [compiler(name), "-std=c11", *flags, f"-DSTEPS={steps}L", *given, "-I.", "slpi_inverse.c", str(source)]
+    command = [compiler(name), *WARNINGS, *flags, f"-DSTEPS={steps}L", *given, "-I.", "slpi_inverse.c", str(source)]
     done = subprocess.run([*command, "-lm", "-o", "hostile"], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     said = subprocess.run([folder / "hostile"], capture_output=True, text=True)

@@ -305,13 +305,8 @@ def context_of(stage: ExportedStage) -> Mapping[str, Any]:
 
 def _stack_bound(stage: ExportedStage) -> str:
     """Return the sentence on the error by a loop that is forgotten."""
-    told = []
-    for axis in stage.axes:
-        if axis.densest is not None:
-            span = axis.allowed.upper - axis.allowed.lower
-            area = (2.0 * span / (TURNS - 2)) ** 2
-            told.append(f"axis {comment(axis.name)} {axis.densest * area:.2g} m")
-    return f"With 64 that is at most, for each: {', '.join(told)}." if told else ""
+    told = [f"axis {comment(axis.name)} {axis.forgotten(TURNS):.2g} m" for axis in stage.axes]
+    return f"With {TURNS} that is at most, for each: {', '.join(told)}."
 
 
 def c_files(stage: ExportedStage) -> dict[str, str]:

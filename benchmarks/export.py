@@ -16,6 +16,7 @@ import sys
 import tempfile
 import time
 from dataclasses import replace
+from functools import partial
 from math import inf
 from pathlib import Path
 
@@ -32,10 +33,11 @@ from slpi_ros.effects.resonance import Resonance
 from slpi_ros.effects.saturation import Saturation
 from slpi_ros.effects.self_heating import SelfHeating
 from slpi_ros.effects.slew import Slew
+from slpi_ros.effects.surroundings import Quantity, Surroundings
 from slpi_ros.errors import SlpiError
 from slpi_ros.export.c_source import c_files
 from slpi_ros.export.stage import ExportedStage
-from slpi_ros.export.vectors import UNREACHABLE, code_of, path
+from slpi_ros.export.vectors import UNREACHABLE, code_of, courses, path, surround
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.multi_slope import MultiSlope
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
@@ -47,9 +49,15 @@ SHIM = """
 #include <stddef.h>
 #include "slpi_inverse.c"
 size_t slpi_size(void) { return sizeof(slpi_inverse_t); }
-void slpi_run(slpi_inverse_t *inverse, int n, const slpi_real *dt, const slpi_real *y, slpi_real *v, int *code)
+void slpi_run(slpi_inverse_t *inverse, int n, const slpi_real *dt, const slpi_real *y, const slpi_real *given,
+    slpi_real *v, int *code)
 {
     for (int k = 0; k < n; k++) {
+#ifdef SLPI_SURROUNDINGS
+        for (int i = 0; given != NULL && i < SLPI_SURROUNDINGS; i++) {
+            slpi_inverse_set(inverse, i, given[k * SLPI_SURROUNDINGS + i]);
+        }
+#endif
         code[k] = slpi_inverse_step(inverse, dt[k], y + k * SLPI_AXES, v + k * SLPI_AXES);
     }
 }
@@ -95,10 +103,27 @@ DRAWS = {
     "contact": lambda rng: Contact(rng.uniform(2e-6, 9e-6), rng.uniform(0.3, 1.5)),
     "resonance": lambda rng: Resonance((Mode(rng.uniform(80, 600), rng.uniform(0.01, 0.1), rng.uniform(0.2, 1.0)),)),
     "self_heating": lambda rng: SelfHeating(10 ** rng.uniform(-10, -8), rng.uniform(1, 100), 1e-6),
+    "surroundings": lambda rng: Surroundings(
+        (
+            Quantity(
+                "/temperature",
+                "",
+                20.0,
+                rng.uniform(-1e-7, 1e-7),
+                rng.uniform(-1e-3, 1e-3),
+                10 ** rng.uniform(-1, 3),
+                rng.choice([0.0, 1.0]),
+                15.0,
+                25.0,
+            ),
+            Quantity("/load", "", 0.0, rng.uniform(-1e-8, 1e-8), lowest=0.0, highest=10.0),
+        ),
+        1e-6,
+    ),  # fmt: skip
     "gain_drift": lambda rng: GainDrift((1.0,), (rng.uniform(-0.1, 0.1),), 1e-6),
 }
 # Effects whose inverse multiplies no rounding error, and groups by the number of others.
-SMOOTH = ("saturation", "contact", "gain_drift", "self_heating", "creep")
+SMOOTH = ("saturation", "contact", "gain_drift", "self_heating", "creep", "surroundings")
 GROUPS = ("without the following", "one of lag, slew, rate law, modes", "several of them")
 
 
@@ -162,25 +187,28 @@ class Compiled:
         self.dtype = np.float32 if "-DSLPI_FLOAT" in flags else np.float64
         self.state = ctypes.create_string_buffer(self.size)
 
-    def run(self, dt, y):
-        """Return voltages, codes, and the time (s) of a step, the best of three runs."""
+    def run(self, dt, y, given=None, times=1):
+        """Return voltages, codes, and the time (s) of a step, the best of some runs."""
         dt, y = np.ascontiguousarray(dt, self.dtype), np.ascontiguousarray(y, self.dtype)
-        v, code, times = np.empty_like(y), np.empty(dt.size, np.int32), []
-        at = [each.ctypes.data_as(ctypes.c_void_p) for each in (dt, y, v, code)]
-        for _ in range(3):
+        v, code, took = np.empty_like(y), np.empty(dt.size, np.int32), []
+        values = None if given is None else np.ascontiguousarray(given, self.dtype)
+        at = [None if each is None else each.ctypes.data_as(ctypes.c_void_p) for each in (dt, y, values, v, code)]
+        for _ in range(times):
             self.library.slpi_inverse_init(self.state, None)
             started = time.process_time()
             self.library.slpi_run(self.state, dt.size, *at)
-            times.append((time.process_time() - started) / dt.size)
-        return v.astype(np.float64), code, min(times)
+            took.append((time.process_time() - started) / dt.size)
+        return v.astype(np.float64), code, min(took)
 
 
-def streamed(stage, t, y):
+def streamed(stage, t, y, given=None):
     """Return what the stream of Python answers, and its time (s) of a step."""
     stream, names = stage.stream(), [axis.name for axis in stage.axes]
     v, codes = np.empty(y.shape), np.zeros(t.size, np.int32)
     started = time.process_time()
     for k, (now, desired) in enumerate(zip(t.tolist(), y.tolist(), strict=True)):
+        if given is not None:
+            surround(stream, stage, given[k])
         try:
             stream.step(now, dict(zip(names, desired, strict=True)))
         except SlpiError as error:
@@ -199,9 +227,14 @@ def smooth(stage, steps):
     return t, ranges[:, 0] + np.outer(shares, np.diff(ranges, axis=1)[:, 0])
 
 
+def reached(codes):
+    """Return the number of steps before the first one that a model cannot reach."""
+    return int(np.argmax(codes == UNREACHABLE)) if (codes == UNREACHABLE).any() else codes.size
+
+
 def largest(stage, one, other, codes):
     """Return the largest difference as a share of the voltage range, up to what a model cannot reach."""
-    end = int(np.argmax(codes == UNREACHABLE)) if (codes == UNREACHABLE).any() else codes.size
+    end = reached(codes)
     widths = [axis.allowed.upper - axis.allowed.lower for axis in stage.axes]
     return float((np.abs(one - other)[:end] / widths).max(initial=0.0))
 
@@ -209,6 +242,7 @@ def largest(stage, one, other, codes):
 def agreement(models, steps, folder, rng):
     """Compare random models on hostile paths, and the float build on smooth ones."""
     errors, floats, sizes, each = [], {group: [] for group in GROUPS}, [], max(steps // models, 200)
+    compared = 0
     for k in range(models):
         kind = ("slpi", "pi", "mpi")[k % 3]
         names = [name for name in DRAWS if rng.uniform() < (0.0, 0.3, 0.6)[k % 4 % 3]]
@@ -216,26 +250,34 @@ def agreement(models, steps, folder, rng):
         own = folder / str(k)
         own.mkdir()
         stamps, y = path(one, each, seed=k)
-        compiled = Compiled(own, one)
-        expected, codes, _ = streamed(one, stamps * 1e-9, y)
-        answers, _, _ = compiled.run(np.diff(stamps * 1e-9, prepend=0.0), y)
+        # The compiler takes longer than the steps.
+        compiled = Compiled(own, one, "-O0")
+        given = courses(one, each, seed=k)
+        expected, codes, _ = streamed(one, stamps * 1e-9, y, given)
+        answers, _, _ = compiled.run(np.diff(stamps * 1e-9, prepend=0.0), y, given)
         errors.append(largest(one, answers, expected, codes))
+        compared += reached(codes)
         sizes.append(compiled.size / len(one.axes))
         t, y = smooth(one, 20_000)
         double, codes, _ = compiled.run(np.diff(t, prepend=0.0), y)
-        single, _, _ = Compiled(own, one, "-DSLPI_FLOAT").run(np.diff(t, prepend=0.0), y)
+        single, _, _ = Compiled(own, one, "-O0", "-DSLPI_FLOAT").run(np.diff(t, prepend=0.0), y)
+        rounded, _, _ = compiled.run(np.diff(t, prepend=0.0), y.astype(np.float32))
         group = GROUPS[min(len(set(names) - set(SMOOTH)), 2)]
-        floats[group].append(largest(one, single, double, codes))
-        if sys.stderr.isatty():
-            print(f"\r{k + 1} of {models}", end="", file=sys.stderr)
+        floats[group].append([largest(one, each, double, codes) for each in (single, rounded)])
+        if (k + 1) % 10 == 0:
+            print(f"{k + 1} of {models} models, {compared} steps: {max(errors):.3g}", file=sys.stderr, flush=True)
     print(
-        f"agreement, double: {models} models x {each} steps, largest difference {max(errors):.3g} of the voltage range"
+        f"agreement, double: {compared} of {models} x {each} steps (the others come after one that a model does not "
+        f"reach), largest difference {max(errors):.3g} of the voltage range"
     )
     print(f"  {sum(error == 0.0 for error in errors)} of {models} models to the last bit; allowed 1e-12")
     for group, found in floats.items():
         if found:
-            spread = f"median {np.median(found):.2g}, largest {max(found):.2g}"
-            print(f"float on smooth paths, {group}: {spread} ({len(found)} models)")
+            (all_, least), (most, least_most) = np.median(found, axis=0), np.max(found, axis=0)
+            print(
+                f"float on smooth paths, {group}: median {all_:.2g}, largest {most:.2g}; of it double with setpoints "
+                f"rounded to float {least:.2g}, {least_most:.2g} ({len(found)} models)"
+            )
     print(f"state of an axis, 64 turning points: median {np.median(sizes):.0f}, largest {max(sizes):.0f} bytes")
 
 
@@ -248,7 +290,7 @@ def durations(folder, rng, steps=200_000, models=9):
             own.mkdir()
             one = stage(rng, ("slpi", "pi", "mpi")[k % 3], names)
             t, y = smooth(one, steps)
-            _, _, mine = Compiled(own, one).run(np.diff(t, prepend=0.0), y)
+            _, _, mine = Compiled(own, one).run(np.diff(t, prepend=0.0), y, times=3)
             _, _, its = streamed(one, t[:4000], y[:4000])
             found.append((mine, its))
         mine, its = np.median(found, axis=0)
@@ -307,14 +349,18 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=1_000_000, help="steps of all models; default: 1e6")
     parser.add_argument("--models", type=int, default=200)
+    parser.add_argument("--only", choices=("times", "worst", "stack", "agreement"), help="one part; default: all")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     rng = np.random.default_rng(options.seed)
     with tempfile.TemporaryDirectory() as folder:
-        durations(Path(folder), rng)
-        worst(Path(folder), rng)
-        beyond(Path(folder), rng)
-        agreement(options.models, options.steps, Path(folder), rng)
+        parts = {
+            "times": durations, "worst": worst, "stack": beyond,
+            "agreement": partial(agreement, options.models, options.steps),
+        }  # fmt: skip
+        for name, part in parts.items():
+            if options.only in (None, name):
+                part(Path(folder), rng)
 
 
 if __name__ == "__main__":

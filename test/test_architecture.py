@@ -202,6 +202,7 @@ NAMED_ELSEWHERE = {
     "reports/verification.py": ({"delay"}, "the same, in words"),
     "nodes/compensator.py": ({"surroundings"}, "the same"),
     "nodes/compensator_parameters.py": ({"surroundings"}, "the same"),
+    "export/stage.py": ({"surroundings"}, "its quantities come into the exported source by a call of their own"),
     "nodes/identify.py": ({"surroundings"}, "the parameter, which names topics"),
 }
 

@@ -37,6 +37,7 @@ def _run(options: Namespace) -> Result:
     stage, target = ExportedStage.of(model, limits, options.axis), TARGETS[options.target]
     options.remarks += target.allow(options.output, overwrite=options.overwrite)
     names = target.write(options.output, stage)
+    options.remarks += target.remarks(stage)
     lines = [line for axis in stage.axes for line in axis.describe]
     document = {
         "folder": options.output,

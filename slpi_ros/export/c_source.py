@@ -34,6 +34,7 @@ class Features:
     modes: bool
     factors: bool
     heating: bool
+    surroundings: bool
     gain: bool
     composed: bool
     limit: bool
@@ -52,6 +53,7 @@ class Features:
             modes=any(one.modes.size for one in laws),
             factors=any(one.factors.size for one in laws),
             heating=any(one.heating.size and one.heating[0] for one in laws),
+            surroundings=bool(stage.quantities),
             gain=any(tuple(one.gain) != (0.0, 1.0) for one in laws),
             composed=any(axis.branches.operators.size for axis in stage.axes),
             limit=any(not isinf(axis.allowed.slew) for axis in stage.axes),
@@ -91,8 +93,8 @@ def _matrix(values: NDArray[np.floating[Any]]) -> str:
 class _Tables:
     """Tables and fields of one axis."""
 
-    def __init__(self, axis: ExportedAxis, place: int, has: Features) -> None:
-        self._axis, self._prefix, self._has = axis, f"slpi_{place}", has
+    def __init__(self, axis: ExportedAxis, place: int, has: Features, numbers: Mapping[str, int]) -> None:
+        self._axis, self._prefix, self._has, self._quantities = axis, f"slpi_{place}", has, numbers
         self.tables: list[str] = []
         self.fields: dict[str, str] = {}
         self._limits()
@@ -212,8 +214,27 @@ class _Tables:
         if has.heating:
             gain, tau, origin, most = laws.heating.tolist() if laws.heating.size else (0.0, 1.0, 0.0, 0.0)
             self._numbers(heat_gain=gain, heat_tau=tau, heat_origin=origin, heat_most=most)
+        if has.surroundings:
+            self._surroundings()
         if has.gain:
             self._numbers(gain_origin=laws.gain[0], gain_factor=laws.gain[1])
+
+    def _surroundings(self) -> None:
+        """Add the quantities that the axis follows, with their numbers."""
+        effect = self._axis.surroundings
+        followed = effect.quantities if effect else ()
+        rows = []
+        for one in followed:
+            values = (one.reference, one.offset_gain, one.sensitivity_gain, one.time_constant, one.averaging)
+            rows.append(f"    {{{self._quantities[one.key]}, {', '.join(map(number, values))}}},")
+        if rows:
+            name = f"{self._prefix}_quantity"
+            self.tables.append("\n".join([f"static const slpi_quantity_law_t {name}[] = {{", *rows, "};"]))
+        self.fields |= {
+            "quantities": str(len(rows)),
+            "quantity": f"{self._prefix}_quantity" if rows else "NULL",
+        }
+        self._numbers(surroundings_origin=effect.origin if effect else 0.0)
 
 
 @cache
@@ -238,9 +259,9 @@ def comment(text: str) -> str:
 def context_of(stage: ExportedStage) -> Mapping[str, Any]:
     """Return what the templates are filled with."""
     has, laws = Features.of(stage), [axis.laws for axis in stage.axes]
-    axes = []
+    axes, numbers = [], {one.key: k for k, one in enumerate(stage.quantities)}
     for place, axis in enumerate(stage.axes):
-        made = _Tables(axis, place, has)
+        made = _Tables(axis, place, has, numbers)
         delay = axis.model.chain.delay
         axes.append({
             "name": comment(axis.name), "ahead": repr(delay) if delay else "", "tables": made.tables,
@@ -268,7 +289,12 @@ def context_of(stage: ExportedStage) -> Mapping[str, Any]:
             "factors": max(len(one.factors) for one in laws),
             "operators": operators,
             "knots": 4 * operators + 2,
+            "quantities": max(len(axis.surroundings.quantities) if axis.surroundings else 0 for axis in stage.axes),
         },
+        "quantities": [
+            {"key": comment(one.key), "lowest": f"{one.lowest:.6g}", "highest": f"{one.highest:.6g}"}
+            for one in stage.quantities
+        ],
         "coupling": {
             "gains": _matrix(stage.gains),
             "inverse": _matrix(np.linalg.inv(np.eye(len(axes)) + stage.gains)),
@@ -279,13 +305,8 @@ def context_of(stage: ExportedStage) -> Mapping[str, Any]:
 
 def _stack_bound(stage: ExportedStage) -> str:
     """Return the sentence on the error by a loop that is forgotten."""
-    told = []
-    for axis in stage.axes:
-        if axis.densest is not None:
-            span = axis.allowed.upper - axis.allowed.lower
-            area = (2.0 * span / (TURNS - 2)) ** 2
-            told.append(f"axis {comment(axis.name)} {axis.densest * area:.2g} m")
-    return f"With 64 that is at most, for each: {', '.join(told)}." if told else ""
+    told = [f"axis {comment(axis.name)} {axis.forgotten(TURNS):.2g} m" for axis in stage.axes]
+    return f"With {TURNS} that is at most, for each: {', '.join(told)}."
 
 
 def c_files(stage: ExportedStage) -> dict[str, str]:

@@ -76,9 +76,21 @@ def fmu(stage: ExportedStage, unit: Unit, version: str) -> bytes:
         }
         for name, k in zip(names, places, strict=True)
     ]
+    quantities = [
+        {
+            "name": f"surrounding_{one.key}",
+            "reference": k + 2 * len(names),
+            "causality": "input",
+            "unit": "",
+            "start": repr(one.reference),
+        }
+        for k, one in enumerate(stage.quantities, 1)
+    ]
     context: dict[str, Any] = {
+        "quantities": quantities,
         "version": version, "what": unit.what, "file": file, "token": f"{{{token}}}", "starts": starts,
-        "function": unit.function, "identifier": unit.identifier, "step": repr(STEP), "variables": [*inputs, *outputs],
+        "function": unit.function, "identifier": unit.identifier, "step": repr(STEP),
+        "variables": [*inputs, *outputs, *quantities],
         "description": f"{unit.what} of a piezo stage: {told}",
     }  # fmt: skip
     sources[file] = _filled("slpi_fmu.c", context)

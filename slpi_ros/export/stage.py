@@ -9,10 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
+from slpi_ros.effects.base import Followed
 from slpi_ros.effects.paths import Laws
+from slpi_ros.effects.surroundings import Surroundings
 from slpi_ros.errors import UsageError
 from slpi_ros.hysteresis.kinds import DESCRIPTIONS, PathModel
 from slpi_ros.hysteresis.loop_family import LoopFamily
+from slpi_ros.hysteresis.multi_slope import STEEP, MultiSlope
 from slpi_ros.hysteresis.shapes import FAR, Branches
 from slpi_ros.hysteresis.turning_points import Memory, MemoryState
 from slpi_ros.model.axis_model import AxisModel
@@ -68,7 +71,7 @@ class ExportedAxis:
                 known = bool(effect.shift) or effect.passes != (-inf, inf) or effect.acts_on == "voltage"
             else:
                 laws = effect.laws()
-                known = laws is not None and laws.keys() <= set(Known._fields)
+                known = isinstance(effect, Surroundings) or (bool(laws) and set(laws or {}) <= set(Known._fields))
             refused += [] if known else [effect.name]
         refused += [effect.name for effect in chain.shared if not effect.coupling]
         if refused:
@@ -82,6 +85,11 @@ class ExportedAxis:
             if effect.streaming() is not None:
                 found |= effect.laws() or {}
         return Laws(**found)
+
+    @property
+    def surroundings(self) -> Surroundings | None:
+        """The recorded quantities that it follows, and how."""
+        return next((effect for effect in self.model.chain.own if isinstance(effect, Surroundings)), None)
 
     @cached_property
     def memory(self) -> Memory:
@@ -161,18 +169,17 @@ class ExportedAxis:
         away = [axis for effect in chain.shared for axis in effect.coupling if axis not in self.others]
         return told + [f"{chain.shared[0].name} with {axis}: not in this export, assumed at rest" for axis in away]
 
-    @property
-    def densest(self) -> float | None:
-        """Largest density (m/V^2) of the Everett function; None where it has none, such as single operators."""
-        if not isinstance(self.model.hysteresis, LoopFamily):
-            return None
-        cells, everett = np.diff(self.model.hysteresis.grid), self.model.hysteresis.everett
-        mixed = -np.diff(np.diff(everett, axis=0), axis=1)
-        inside = np.tri(cells.size, k=-1, dtype=bool)[:, :]
-        density = mixed / np.outer(cells, cells)
-        # A cell on the diagonal is a triangle.
-        diagonal = np.diag(everett, -1) / (0.5 * cells**2)
-        return float(max(np.abs(density[inside]).max(initial=0.0), np.abs(diagonal).max()))
+    def forgotten(self, turns: int) -> float:
+        """Return by how much (m) a forgotten loop changes the displacement at most, with so many turns kept."""
+        # Of the rectangles in the Preisach plane between successive turning points the smallest has at most the area of
+        # a square with this side (V). An operator has its relays on a line, which is in it over at most that side.
+        shape, side = self.model.hysteresis, 2.0 * (self.allowed.upper - self.allowed.lower) / (turns - 2)
+        assert not isinstance(shape, PathModel)
+        if isinstance(shape, LoopFamily):
+            return _densest(shape) * side**2
+        if isinstance(shape, MultiSlope):
+            return STEEP * float(shape.weights.sum()) * side
+        return float(np.abs(shape.weights[shape.thresholds > 0.0]).sum()) * side
 
     @property
     def describe(self) -> list[str]:
@@ -212,11 +219,31 @@ class ExportedStage:
         return StageStream(streams, self.model.coupling, self.model.origins)
 
     @cached_property
+    def quantities(self) -> tuple[Followed, ...]:
+        """Recorded quantities that any axis follows, by their numbers."""
+        found = dict[str, Followed]()
+        for axis in self.axes:
+            for one in axis.surroundings.followed if axis.surroundings else ():
+                found.setdefault(one.key, one)
+        return tuple(found.values())
+
+    @cached_property
     def gains(self) -> FloatArray:
         """Coupling gains (m/m), shape (n, n): of the row's axis by the motion of the column's axis."""
         rows: Mapping[str, Mapping[str, float]] = {axis.name: axis.model.chain.gains for axis in self.axes}
         names = list(rows)
         return np.array([[0.0 if one == other else rows[one].get(other, 0.0) for other in names] for one in names])
+
+
+def _densest(family: LoopFamily) -> float:
+    """Return the largest density (m/V^2) of an Everett function."""
+    cells, everett = np.diff(family.grid), family.everett
+    mixed = -np.diff(np.diff(everett, axis=0), axis=1)
+    inside = np.tri(cells.size, k=-1, dtype=bool)
+    density = mixed / np.outer(cells, cells)
+    # A cell on the diagonal is a triangle.
+    diagonal = np.diag(everett, -1) / (0.5 * cells**2)
+    return float(max(np.abs(density[inside]).max(initial=0.0), np.abs(diagonal).max()))
 
 
 def require_numbers(axis: ExportedAxis) -> None:

@@ -10,7 +10,7 @@ from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.export.c_source import c_files
 from slpi_ros.export.fmu import MARK, NAMES, fmu_files
 from slpi_ros.export.stage import ExportedStage
-from slpi_ros.export.vectors import program_files
+from slpi_ros.export.vectors import float_remarks, program_files
 from slpi_ros.io.atomic_file import all_or_nothing, is_replaceable, output_folder
 
 # Bytes at both ends of a file, in which slpi finds its mark if it wrote the file.
@@ -24,6 +24,7 @@ class Target:
     names: tuple[str, ...]
     files: Callable[[ExportedStage], Mapping[str, str] | Mapping[str, bytes]]
     _next: str  # with the folder as ``{}``
+    remarks: Callable[[ExportedStage], list[str]]  # on what was written
 
     def allow(self, folder: str, *, overwrite: bool) -> list[str]:
         """Check that the files may be written; return remarks on what they replace. UsageError if not."""
@@ -81,6 +82,7 @@ TARGETS: Mapping[str, Target] = {
         ("slpi_inverse.h", "slpi_inverse.c", "slpi_test.c"),
         _c,
         "cd {} && cc -std=c11 -O2 slpi_inverse.c slpi_test.c -lm -o slpi_test && ./slpi_test",
+        float_remarks,
     ),
-    "fmu": Target(NAMES, fmu_files, "fmpy validate {}/slpi_inverse_fmi3.fmu"),
+    "fmu": Target(NAMES, fmu_files, "fmpy validate {}/slpi_inverse_fmi3.fmu", lambda stage: []),
 }

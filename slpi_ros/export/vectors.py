@@ -19,20 +19,29 @@ OK, BAD_TIME, NOT_FINITE, OUT_OF_RANGE, UNREACHABLE = range(5)
 STEPS, USUAL = 1200, 1e-4
 # Stored displacements of each mode, and how many more a step needs.
 HISTORY = 128
-# Largest difference to the stream of Python, as a share of the voltage range: double; float; float with states that
-# hardly change in a step, or with the logarithm of a small step. The inverse of a mode multiplies what rounding leaves,
-# that of a lag by its time constant over the step.
-DOUBLE, FLOAT, FLOAT_SLOW, RINGING = 1e-12, 1e-5, 1e-4, 10.0
+# Largest difference to the stream of Python, as a share of the voltage range: double; float; float with creep, whose
+# states hardly change in a step. The inverses of lag, rate law and modes multiply rounding errors, and a model without
+# slope jumps: allowed is what setpoints make that are rounded so many times as coarsely as float does.
+DOUBLE, FLOAT, FLOAT_SLOW, COARSER = 1e-12, 1e-5, 1e-4, 256.0
+# Share of the steps in which a model that jumps at turns may differ by more: with float, a jump comes a step earlier or
+# later.
+STRAY = 0.02
+# Rounding of a float, as a share of the number.
+EPSILON = 2.0**-24
 
 
 @dataclass(frozen=True)
 class Vectors:
-    """Steps: times (s, (N,)), displacements (m, (N, axes)), expected voltages (V, (N, axes)), and codes (N,)."""
+    """Steps: times (s, (N,)), displacements (m, (N, axes)), expected voltages (V, (N, axes)), and codes (N,).
+
+    `surroundings` are values of the quantities that the stage follows, (N, quantities), NaN where none comes.
+    """
 
     dt: FloatArray
     desired: FloatArray
     volts: FloatArray
     codes: NDArray[np.int64]
+    surroundings: FloatArray
 
 
 def code_of(error: SlpiError) -> int:
@@ -51,13 +60,69 @@ def usual_step(stage: ExportedStage) -> float:
     return max(USUAL, round(1e9 * 4.0 / ((HISTORY - 4) * lowest)) * 1e-9)
 
 
-def float_limit(stage: ExportedStage) -> float:
-    """Return the largest difference of the float build on the vectors, as a share of the voltage range."""
-    found = FLOAT
-    for laws in (axis.laws for axis in stage.axes):
-        own = FLOAT_SLOW if laws.relaxations.size or laws.rate.size else FLOAT
-        found = max(found, own * (1.0 + laws.lag / usual_step(stage)) * (RINGING if laws.modes.size else 1.0))
-    return found
+def float_goal(stage: ExportedStage) -> float:
+    """Return the largest difference that `float` should make, as a share of the voltage range."""
+    return FLOAT_SLOW if any(axis.laws.relaxations.size for axis in stage.axes) else FLOAT
+
+
+def smooth(stage: ExportedStage, steps: int) -> tuple[NDArray[np.int64], FloatArray]:
+    """Return stamps (ns, (N,)) and displacements (m, (N, axes)) of a smooth path within the limits."""
+    place = np.arange(steps)
+    shares = 0.5 + 0.3 * np.sin(2.0 * pi * place / 600.0) + 0.1 * np.sin(2.0 * pi * place / 130.0)
+    low, high = np.array([axis.model.displacement_range for axis in stage.axes]).T
+    return round(usual_step(stage) * 1e9) * place, low + np.outer(shares, high - low)
+
+
+def by_rounding(
+    stage: ExportedStage, stamps: NDArray[np.int64], desired: FloatArray, given: FloatArray, coarser: float = 1.0
+) -> float:
+    """Return the largest change of the voltages, as a share of their range, by setpoints rounded to `float`.
+
+    Stamps (ns, (N,)) and displacements (m, (N, axes)) are those of `path` or `smooth`, quantities (N, K) those of
+    `courses`. Everything is computed with `double`: a build with `float` can do no better. `coarser`: by what factor
+    the rounding is coarser than that of `float`.
+    """
+    names = [axis.name for axis in stage.axes]
+    ranges = [axis.allowed.upper - axis.allowed.lower for axis in stage.axes]
+    exact, rounded, most = stage.stream(), stage.stream(), 0.0
+    signals = (desired, _rounded(desired, coarser), given, _rounded(given, coarser))
+    for stamp, *values in zip((stamps * 1e-9).tolist(), *signals, strict=True):
+        voltages = []
+        for stream, y, known in ((exact, *values[::2]), (rounded, *values[1::2])):
+            surround(stream, stage, known)
+            try:
+                voltages.append(stream.step(stamp, dict(zip(names, y.tolist(), strict=True))))
+            except SlpiError:
+                # Beyond the model.
+                return most
+        changes = zip(*(one.values() for one in voltages), ranges, strict=True)
+        most = max(most, *(abs(one - other) / span for one, other, span in changes))
+    return most
+
+
+def _rounded(values: FloatArray, coarser: float) -> FloatArray:
+    """Return values on a grid, as `float` has it for the largest ones of a column, times `coarser`."""
+    largest = np.nanmax(np.abs(values), axis=0, initial=0.0)
+    grid = 2.0 * EPSILON * coarser * np.where(largest > 0.0, largest, 1.0)
+    return np.round(values / grid) * grid
+
+
+def _jumps(stage: ExportedStage) -> bool:
+    """Return whether a branch of an axis has pieces without slope, over which the voltage jumps."""
+    return any(axis.branches.operators.size for axis in stage.axes)
+
+
+def float_remarks(stage: ExportedStage) -> list[str]:
+    """Return a remark where `float` is not enough for the model, else nothing."""
+    if _jumps(stage):
+        return ["with float, jumps of a model of kind 'mpi' at turns may come a step earlier or later; use double"]
+    rounding = by_rounding(stage, *smooth(stage, STEPS // 2), courses(stage, STEPS // 2))
+    if rounding <= float_goal(stage):
+        return []
+    return [
+        f"with float, rounding of the setpoints alone moves the voltages by up to {rounding:.1g} of their range on a "
+        f"smooth path with steps of {usual_step(stage):g} s; use double"
+    ]
 
 
 def path(stage: ExportedStage, steps: int, seed: int = 1) -> tuple[NDArray[np.int64], FloatArray]:
@@ -99,18 +164,40 @@ def _displacements(span: tuple[float, float], steps: int, rng: np.random.Generat
     return low + (high - low) * np.concatenate(parts)[:steps]
 
 
+def courses(stage: ExportedStage, steps: int, seed: int = 1) -> FloatArray:
+    """Return values of the quantities that a stage follows, shape (N, quantities); NaN in steps where none comes."""
+    rng = np.random.default_rng(seed)
+    values = np.full((steps, len(stage.quantities)), nan)
+    for column, one in zip(values.T, stage.quantities, strict=True):
+        # The first steps are at the reference.
+        comes = rng.integers(steps // 8, steps, max(steps // 40, 1))
+        column[comes] = rng.uniform(one.lowest, one.highest, comes.size)
+    return values
+
+
+def surround(stream: StageStream, stage: ExportedStage, values: FloatArray) -> None:
+    """Give the stream values of quantities, shape (quantities,); NaN: none comes."""
+    known = {one.key: value for one, value in zip(stage.quantities, values.tolist(), strict=True) if value == value}
+    for each in stream.streams.values():
+        each.surround(known)
+
+
 def vectors(stage: ExportedStage, steps: int = STEPS, seed: int = 1) -> Vectors:
     """Return steps with the answers of the stream, and among them some that it refuses."""
     stamps, desired = path(stage, steps, seed)
     rng = np.random.default_rng(seed)
     stream, names = stage.stream(), [axis.name for axis in stage.axes]
     before, rows = 0.0, list[tuple[float, list[float], list[float], int]]()
+    given, coming = list[FloatArray](), courses(stage, steps, seed)
     refused = set(rng.integers(2, steps, 12).tolist())
     for k, (stamp, y) in enumerate(zip((stamps * 1e-9).tolist(), desired.tolist(), strict=True)):
+        surround(stream, stage, coming[k])
+        given.append(coming[k])
         if k in refused:
             low, high = stage.axes[-1].accepted
             for dt, wrong in ((0.0, nan), (0.0, high + (high - low)), (-1e-3, y[-1]), (nan, y[-1])):
                 rows.append(_answered(stream, names, before, dt, [*y[:-1], wrong]))
+                given.append(coming[k])
         try:
             rows.append(_answered(stream, names, before, stamp - before, y, stamp))
         except SlpiError:
@@ -118,7 +205,8 @@ def vectors(stage: ExportedStage, steps: int = STEPS, seed: int = 1) -> Vectors:
             break
         before = stamp
     times, wanted, volts, codes = zip(*rows, strict=True)
-    return Vectors(np.array(times), np.array(wanted), np.array(volts), np.array(codes, dtype=np.int64))
+    kinds = np.array(codes, dtype=np.int64)
+    return Vectors(np.array(times), np.array(wanted), np.array(volts), kinds, np.array(given[: len(rows)]))
 
 
 def _answered(
@@ -148,13 +236,18 @@ def program_files(stage: ExportedStage, steps: int = STEPS) -> dict[str, str]:
             "desired": [constant(one) for one in y],
             "volts": [constant(v) for v in volts],
             "code": code,
+            "given": [constant(one) for one in values],
         }
-        for dt, y, volts, code in zip(
-            *(found.dt.tolist(), found.desired.tolist(), found.volts.tolist(), found.codes.tolist()), strict=True
+        for dt, y, volts, code, values in zip(
+            *(found.dt.tolist(), found.desired.tolist(), found.volts.tolist(), found.codes.tolist()),
+            *(found.surroundings.tolist(),),
+            strict=True,
         )
     ]
     ranges = [repr(axis.allowed.upper - axis.allowed.lower) for axis in stage.axes]
-    limits = {"double_limit": repr(DOUBLE), "float_limit": repr(float_limit(stage))}
+    allowed = max(float_goal(stage), by_rounding(stage, *path(stage, steps), courses(stage, steps), COARSER))
+    limits = {"double_limit": repr(DOUBLE), "float_limit": f"{allowed:.3g}", "coarser": f"{COARSER:g}"}
+    limits["strays"] = str(round(STRAY * len(rows)) if _jumps(stage) else 0)
     more: dict[str, Any] = {"rows": rows, "ranges": ranges, **limits}
     context = {**context_of(stage), **more}
     return {"slpi_test.c": templates().get_template("slpi_test.c.j2").render(context)}

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from slpi_ros.errors import SlpiError
 from slpi_ros.export.c_source import c_files
 from slpi_ros.export.stage import ExportedStage
-from slpi_ros.export.vectors import code_of
+from slpi_ros.export.vectors import code_of, surround
 
 FloatArray = NDArray[np.float64]
 _COUNT = count()
@@ -28,10 +28,19 @@ size_t slpi_size(void);
 size_t slpi_size(void) { return sizeof(slpi_inverse_t); }
 int slpi_depth(const slpi_inverse_t *inverse, int axis);
 int slpi_depth(const slpi_inverse_t *inverse, int axis) { return inverse->axis[axis].memory.now.depth; }
-void slpi_run(slpi_inverse_t *inverse, int n, const slpi_real *dt, const slpi_real *y, slpi_real *v, int *code);
-void slpi_run(slpi_inverse_t *inverse, int n, const slpi_real *dt, const slpi_real *y, slpi_real *v, int *code)
+void slpi_run(slpi_inverse_t *inverse, int n, const slpi_real *dt, const slpi_real *y, const slpi_real *given,
+    slpi_real *v, int *code);
+void slpi_run(slpi_inverse_t *inverse, int n, const slpi_real *dt, const slpi_real *y, const slpi_real *given,
+    slpi_real *v, int *code)
 {
+    (void)given;
     for (int k = 0; k < n; k++) {
+#ifdef SLPI_SURROUNDINGS
+        for (int i = 0; i < SLPI_SURROUNDINGS; i++) {
+            /* Not a number: none comes, and none is taken. */
+            slpi_inverse_set(inverse, i, given[k * SLPI_SURROUNDINGS + i]);
+        }
+#endif
         code[k] = slpi_inverse_step(inverse, dt[k], y + k * SLPI_AXES, v + k * SLPI_AXES);
     }
 }
@@ -57,6 +66,7 @@ class Built:
 
     library: ctypes.CDLL
     axes: int
+    quantities: int
     number: type
 
     def __post_init__(self) -> None:
@@ -73,11 +83,19 @@ class Built:
         given = None if volts is None else np.array(volts, dtype=self.dtype)
         return self.library.slpi_inverse_init(self.state, None if given is None else self._at(given))
 
-    def run(self, dt: FloatArray, y: FloatArray) -> tuple[FloatArray, NDArray[np.int32]]:
-        """Return the voltages, (N, axes), and the codes, (N,), of `dt` (N,) and `y` (N, axes)."""
+    def run(
+        self, dt: FloatArray, y: FloatArray, given: FloatArray | None = None
+    ) -> tuple[FloatArray, NDArray[np.int32]]:
+        """Return the voltages, (N, axes), and the codes, (N,), of `dt` (N,) and `y` (N, axes).
+
+        `given` are values of the quantities that the stage follows, (N, quantities), NaN: none comes.
+        """
         dt, y = np.ascontiguousarray(dt, dtype=self.dtype), np.ascontiguousarray(y, dtype=self.dtype)
+        values = np.full((dt.size, max(self.quantities, 1)), np.nan) if given is None else given
+        values = np.ascontiguousarray(values, dtype=self.dtype)
         v, code = np.empty(y.shape, dtype=self.dtype), np.empty(dt.size, dtype=np.int32)
-        self.library.slpi_run(self.state, dt.size, self._at(dt), self._at(y), self._at(v), self._at(code))
+        places = map(self._at, (dt, y, values, v, code))
+        self.library.slpi_run(self.state, dt.size, *places)
         return v.astype(np.float64), code
 
     def drive(self, dt: float, volts: Sequence[float]) -> FloatArray:
@@ -95,19 +113,23 @@ def build(folder: Path, stage: ExportedStage, *flags: str, name: str = "gcc") ->
     (folder / "shim.c").write_text(SHIM)
     # A library that is loaded once is not loaded anew from the same place.
     library = folder / f"inverse{next(_COUNT)}.so"
-    command = [compiler(name), *WARNINGS, "-O1", "-shared", "-fPIC", *flags, "shim.c", "-o", str(library), "-lm"]
+    command = [compiler(name), *WARNINGS, "-O0", "-shared", "-fPIC", *flags, "shim.c", "-o", str(library), "-lm"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     number = ctypes.c_float if "-DSLPI_FLOAT" in flags else ctypes.c_double
-    return Built(ctypes.CDLL(str(library)), len(stage.axes), number)
+    return Built(ctypes.CDLL(str(library)), len(stage.axes), len(stage.quantities), number)
 
 
-def by_python(stage: ExportedStage, t: FloatArray, y: FloatArray) -> tuple[FloatArray, NDArray[np.int32]]:
+def by_python(
+    stage: ExportedStage, t: FloatArray, y: FloatArray, given: FloatArray | None = None
+) -> tuple[FloatArray, NDArray[np.int32]]:
     """Return what the stream of Python gives, as `Built.run`, for stamps `t` (N,), s."""
     stream = stage.stream()
     names = [axis.name for axis in stage.axes]
     v, code = np.empty(y.shape), np.zeros(t.size, dtype=np.int32)
     for k, (now, desired) in enumerate(zip(t.tolist(), y.tolist(), strict=True)):
+        if given is not None:
+            surround(stream, stage, given[k])
         try:
             stream.step(now, dict(zip(names, desired, strict=True)))
         except SlpiError as error:

@@ -66,6 +66,13 @@ int main(void)
             /* Only every second axis is wrong at a time, so that some steps are taken. */
             desired[i] = (slpi_real)((random_bits() & 1) ? uniform(low[i], high[i]) : hostile_displacement(low[i], high[i]));
         }
+#ifdef SLPI_SURROUNDINGS
+        if (random_bits() % 32 == 0) {
+            const double values[] = {(double)NAN, (double)INFINITY, 1e300, -1e30, 5e-324, uniform(-1e3, 1e3), 0.0};
+            slpi_inverse_set(&inverse, (int)(random_bits() % (SLPI_SURROUNDINGS + 2)) - 1,
+                (slpi_real)(random_bits() % 8 ? uniform(0.0, 20.0) : values[random_bits() % 7]));
+        }
+#endif
         if (random_bits() % 64 == 0) {
             slpi_inverse_drive(&inverse, dt, desired, NULL);
             continue;

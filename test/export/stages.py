@@ -20,6 +20,7 @@ from slpi_ros.effects.resonance import Resonance
 from slpi_ros.effects.saturation import Saturation
 from slpi_ros.effects.self_heating import SelfHeating
 from slpi_ros.effects.slew import Slew
+from slpi_ros.effects.surroundings import Quantity, Surroundings
 from slpi_ros.hysteresis.kinds import CausalModel
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.multi_slope import MultiSlope
@@ -31,13 +32,21 @@ QUALITY = FitQuality(8e-9, 3e-8, 8e-9, 8e-9, 1234, 0.75, "bag")
 KINDS = ("pi", "slpi", "mpi")
 STAGE_EFFECTS = (
     *("delay", "lag", "slew", "saturation", "rate_dependence", "creep", "contact", "resonance", "self_heating"),
-    *("gain_drift", "hum", "sensor_periodic"),
+    *("surroundings", "gain_drift", "hum", "sensor_periodic"),
 )
 # One of each, on a stage of 10 um.
 EVERY: tuple[Effect, ...] = (
     *(Delay(1e-3), Lag(1e-3), Slew(3e4), Saturation(-5.0, 95.0), RateDependence(0.5, 10.0, 2e-9)),
     *(Creep((0.3, 5.0), (0.02, 0.01)), Contact(6e-6, 0.8), Resonance((Mode(200.0, 0.02, 0.5), Mode(300.0, 0.03, 0.3)))),
-    *(SelfHeating(1e-8, 3.0, 1e-6), GainDrift((1.0,), (0.05,), 1e-6)),
+    SelfHeating(1e-8, 3.0, 1e-6),
+    Surroundings(
+        (
+            Quantity("/room/temperature", "", 20.0, 3e-8, 1e-3, 0.5, 0.02, lowest=18.0, highest=24.0),
+            Quantity("/load", "force.z", 0.0, -2e-8, 0.0, 0.0, 0.0, lowest=0.0, highest=5.0),
+        ),
+        1e-6,
+    ),
+    GainDrift((1.0,), (0.05,), 1e-6),
 )
 
 

@@ -13,18 +13,20 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.export import fmu
 from slpi_ros.export.stage import ExportedStage
 from slpi_ros.export.targets import TARGETS
-from slpi_ros.export.vectors import path
+from slpi_ros.export.vectors import courses, path, surround
 from slpi_ros.model.limits import Limits
 
 fmpy = pytest.importorskip("fmpy")
 validation = pytest.importorskip("fmpy.validation")
 FREE = Limits(-inf, inf)
+FOLLOWS = next(effect for effect in EVERY if effect.name == "surroundings")
+TOPICS = {"surrounding_/room/temperature", "surrounding_/load:force.z"}
 
 
 @pytest.fixture(scope="module")
 def stage():
     # Each effect is tested in the C source; four units of all of them take long to compile.
-    return ExportedStage.of(two_axes((Lag(1e-3), Creep((0.3, 5.0), (0.02, 0.01)))), FREE)
+    return ExportedStage.of(two_axes((Lag(1e-3), Creep((0.3, 5.0), (0.02, 0.01)), FOLLOWS)), FREE)
 
 
 @pytest.fixture(scope="module")
@@ -55,10 +57,16 @@ class Running:
         self.unit.enterInitializationMode()
 
     def _which(self, causality):
-        return [each.valueReference for each in self.description.modelVariables if each.causality == causality]
+        variables = [each for each in self.description.modelVariables if each.causality == causality]
+        return [each.valueReference for each in variables if not each.name.startswith("surrounding_")]
 
-    def set(self, values):
-        (self.unit.setFloat64 if self.new else self.unit.setReal)(self._which("input"), values)
+    def set(self, values, given=()):
+        setting = self.unit.setFloat64 if self.new else self.unit.setReal
+        setting(self._which("input"), values)
+        for name, value in zip(sorted(TOPICS, reverse=True), given, strict=False):
+            # Not a number: none comes.
+            if value == value:
+                setting([self.references[name]], [value])
 
     def get(self):
         return np.array((self.unit.getFloat64 if self.new else self.unit.getReal)(self._which("output")))
@@ -85,13 +93,15 @@ def test_the_inverse_has_the_answers_of_the_stream(stage, units, tmp_path, versi
     low, high = np.array([axis.model.displacement_range for axis in stage.axes]).T
     t, y, stream = stamps * 1e-9, np.clip(y, low, high), stage.stream()
     unit = Running(units[f"slpi_inverse_fmi{version}.fmu"], tmp_path)
-    assert set(unit.references) - {"time"} == {"desired_x", "desired_y", "voltage_x", "voltage_y"}
+    assert set(unit.references) - {"time"} == {"desired_x", "desired_y", "voltage_x", "voltage_y"} | TOPICS
+    given = courses(stage, t.size)
     unit.set(y[0].tolist())
     unit.unit.exitInitializationMode()
     for k, now in enumerate(t.tolist()):
         if k:
-            unit.set(y[k].tolist())
+            unit.set(y[k].tolist(), given[k])
             unit.step(t[k - 1], now - t[k - 1])
+        surround(stream, stage, given[k])
         expected = list(stream.step(now, dict(zip("xy", y[k].tolist(), strict=True))).values())
         assert np.abs(unit.get() - expected).max() <= 1e-10
         if k == 200:

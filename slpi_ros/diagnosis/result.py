@@ -26,7 +26,7 @@ OTHER_FREQUENCIES = "This record has one drive frequency; other frequencies tell
 UP_TO_DATE = "`slpi refit` with this record brings the model up to date; no other one is needed for that."
 ANOTHER_HYSTERESIS = {
     NOT_CLOSING: "No model with return-point memory can follow loops that do not close: compensate with "
-    "feedback, and record the drive of `slpi excite --for creep` to see whether they close where time is left.",
+    "feedback, and record `{command} --for creep` to see whether they close where time is left.",
     LEVEL: "Loops between the same two voltages differ with the loop that they lie in, which no "
     "model here can follow: identify on drives like those to be compensated, or compensate with feedback.",
     BIAS: "The shape of the loops depends on the bias voltage, which the kind of the given "
@@ -389,7 +389,14 @@ def _next(
     verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], left: Sequence[Left], *, stale: bool
 ) -> str | None:
     steps = [UP_TO_DATE] if stale else []
-    steps += [] if verdict == NOTHING_FOUND else [_of_structure(structure) for structure in selection.structures]
+    steps += (
+        []
+        if verdict == NOTHING_FOUND
+        else [
+            ANOTHER_HYSTERESIS[structure].format(command=_command(selection.now.evidence))
+            for structure in selection.structures
+        ]
+    )
     if verdict == AMBIGUOUS:
         first = next((named for named in effects if named.alternatives), effects[0])
         steps.append(_separating((first.name, *first.alternatives), selection.now.evidence))
@@ -431,8 +438,3 @@ def _command(evidence: Evidence) -> str:
         f"slpi excite -o drive.csv --voltage-min {low:.4g} --voltage-max {high:.4g} --rate {rate:.4g} "
         f"--duration {seconds:.3g}{slow}"
     )
-
-
-def _of_structure(structure: str) -> str:
-    """Return the recommendation for a defect of the hysteresis model, in a sentence."""
-    return ANOTHER_HYSTERESIS[structure]

@@ -22,6 +22,8 @@ WORSE, WORSE_BY_NOISE = 1.1, 4.0
 # Times that learning goes back to the best pass without a better one since, and passes in a row that cannot be learned
 # from, until it is held.
 MOST_RETURNS, MOST_REFUSED = 2, 3
+# How a text begins that says why learning is held.
+HELD = "held"
 # Passes after which the best one is forgotten, as the stage is another one by then.
 BEST_PASSES = 50
 # Largest part of the stroke that learning may add to the desired path, by default.
@@ -157,9 +159,16 @@ class AxisLearner:
         return math.sqrt(self._power(self.harmonics.noise))
 
     def update(
-        self, measured: FloatArray, voltage: FloatArray | None = None, followed: FloatArray | None = None
+        self,
+        measured: FloatArray,
+        voltage: FloatArray | None = None,
+        followed: FloatArray | None = None,
+        unusable: str = "",
     ) -> PassReport:
-        """Learn from a pass of which the path `followed` (m; default: `path`) was asked; shape (N,), m and V."""
+        """Learn from a pass of which the path `followed` (m; default: `path`) was asked; shape (N,), m and V.
+
+        `unusable`: why it is not to be learned from, if that is known.
+        """
         if followed is not None and not np.allclose(followed, self.path, rtol=0.0, atol=SAME_PATH):
             self.correction = self._before = followed - self.desired
         commanded = self.path - self.desired
@@ -186,7 +195,7 @@ class AxisLearner:
         judged = judge(seen, expected, math.sqrt(power), floor, self._deviating, error)
         if self._lead_in is not None and not judged.reason:
             judged = agreed(self._lead_in, judged, self.desired, floor)
-        reason = self._replayed(measured) or judged.reason or self._held_back(voltage)
+        reason = unusable or self._replayed(measured) or judged.reason or self._held_back(voltage)
         offset, drift = self._offset_and_drift(judged, expected, first=first)
         clean = judged.measured - offset - drift * (np.arange(measured.size) / measured.size - 0.5)
         rest = (clean - self.desired)[np.isfinite(clean)]
@@ -304,7 +313,7 @@ class AxisLearner:
         self.harmonics = self.harmonics.doubted(self._guess)
         self._told = f"{why}; back to the best, at half the gain"
         if self.returns >= MOST_RETURNS:
-            self.held = f"held: {why}, for the second time"
+            self.held = f"{HELD}: {why}, for the second time"
 
     def _refuse(self, reason: str, *, new: bool) -> None:
         """Leave a pass alone, and go back to the best path from a new one; after several in a row, hold."""
@@ -313,7 +322,7 @@ class AxisLearner:
         if self.best is not None and (new or self.refused >= MOST_REFUSED):
             self.correction, self._returned, self._ring_since = self.best.correction, True, 0
         if self.refused >= MOST_REFUSED:
-            self.held = f"held: {MOST_REFUSED} passes in a row were not learned from, the last as {reason}"
+            self.held = f"{HELD}: {MOST_REFUSED} passes in a row were not learned from, the last as {reason}"
 
     def limited_by(self, drift: float) -> str:
         """Return what keeps the error where it is: noise, bandwidth, learn_limit, voltage range, drift, or learning."""

@@ -98,7 +98,10 @@ def test_a_mode_that_rings_from_pass_to_pass_is_waited_for(model, hertz):
     mode = Resonance(modes=(Mode(frequency=223.0, damping=0.01, gain=1.0),))
     told = slpi_ros.StageModel({"x": replace(model.axes["x"], effects=(mode,))})
     t, desired = path(hertz)
-    learner, stage = slpi_ros.Learner(told, t, desired), Stage(desired[0], frequency=226.0, damping=0.01, inverted=(223.0, 0.01))
+    learner, stage = (
+        slpi_ros.Learner(told, t, desired),
+        Stage(desired[0], frequency=226.0, damping=0.01, inverted=(223.0, 0.01)),
+    )
     errors = []
     for _ in range(25):
         true, read = stage.run(learner.path())

@@ -1,0 +1,190 @@
+"""Passes of paths that come again: recognised by their content, recorded while they are followed; without ROS."""
+
+from array import array
+from collections.abc import Iterable, Mapping, Sequence
+
+import numpy as np
+
+from slpi_ros.arrays import FloatArray, Mask
+from slpi_ros.compensator.axis import Axis
+from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.learning.repeated_paths import FinishedPass, SampledPath
+
+# Paths whose identity is remembered.
+KNOWN_PATHS = 64
+# Time after the end of a pass until its last reading has come.
+LAST_READING_NS = SECOND_NS // 10
+# Readings further apart than this many of their intervals are a gap.
+GAP = 3.0
+# Longest time between two outputs (s), or this many output periods if that is more; what is read after a longer one
+# counts from this time (s) on. A pass that has no reading at more than this share of its samples tells nothing.
+LATE, LATE_PERIODS, RECOVERED, MOST_LATE = 0.01, 5.0, 0.01, 0.1
+# Samples in a row that a limit held back in the midst of a pass, from which it is not learned from.
+HELD_SAMPLES = 3
+
+
+class PassRecorder:
+    """The readings and outputs of one pass that begins at `begin_ns`, ns on the clock of trajectories."""
+
+    # Without `learns` only the setpoints are told.
+    def __init__(
+        self, path: SampledPath, begin_ns: int, correction: Mapping[str, FloatArray], period: float, learns: bool = True
+    ) -> None:
+        self.path, self.begin_ns, self.period, self.learns = path, begin_ns, period, learns
+        self.correction = {name: np.asarray(correction.get(name, 0.0) + 0.0 * y) for name, y in path.desired.items()}
+        self.end_ns = begin_ns + round(float(path.t[-1]) * SECOND_NS)
+        self._read: dict[str, tuple[array[float], array[float]]] = {
+            name: (array("d"), array("d")) for name in path.desired
+        }
+        # Time (s), voltage (V), 1 where a voltage limit or 2 where the slew limit holds back.
+        self._output: dict[str, tuple[array[float], array[float], array[int]]] = {
+            name: (array("d"), array("d"), array("b")) for name in path.desired
+        }
+
+    def read(self, name: str, reading: float, at_ns: int) -> None:
+        """Take a reading (m) at `at_ns`; those of other axes and times are left alone."""
+        kept = self._read.get(name)
+        if kept is not None and self.begin_ns <= at_ns:
+            kept[0].append((at_ns - self.begin_ns) * 1e-9)
+            kept[1].append(reading)
+
+    def output(self, axes: Iterable[Axis], at_ns: int) -> None:
+        """Take what has been output at `at_ns`, and tell each axis how much of its setpoint was learned."""
+        at = (at_ns - self.begin_ns) * 1e-9
+        place = min(max(int(at / self.path.interval + 0.5), 0), self.path.t.size - 1)
+        for axis in axes:
+            kept = self._output.get(axis.name)
+            if kept is not None:
+                kept[0].append(at)
+                kept[1].append(axis.voltage)
+                kept[2].append(1 if axis.held else 2 if axis.slewing else 0)
+                axis.tracking.learned = float(self.correction[axis.name][place])
+
+    def finished(self) -> FinishedPass:
+        """Return what the pass says."""
+        t, path = self.path.t, self.path
+        measured, voltage, unusable, dropped = {}, {}, {}, ""
+        for name, desired in path.desired.items():
+            out_t, out_v, limited = (np.array(each) for each in self._output[name])
+            at, readings = (np.array(each) for each in self._read[name])
+            reading = _at(t, at, readings, path.interval)
+            if not out_t.size:
+                dropped = "it was not output"
+                measured[name], voltage[name] = reading, np.full(desired.size, np.nan)
+                continue
+            lost = self._late(out_t)
+            if float(np.mean(lost)) > MOST_LATE:
+                longest = float(np.max(np.diff(np.concatenate([[0.0], out_t, [t[-1]]]))))
+                dropped = f"the computer was busy: the path was output up to {longest * 1e3:.3g} ms late"
+            # On the way to a path that begins elsewhere, the slew limit holds back; that is no part of the pass.
+            begun = int(np.argmin(limited == 2)) if (limited != 2).any() else limited.size - 1
+            lost |= t < out_t[begun] if begun else lost
+            measured[name] = reading = np.where(lost, np.nan, reading)
+            missing = float(np.mean(np.isnan(reading)))
+            if missing > MOST_LATE and not dropped:
+                dropped = f"axis '{name}': {100 * missing:.0f} % of its samples have no reading"
+            voltage[name] = np.interp(t, out_t, out_v)
+            held, slow = int(np.count_nonzero(limited == 1)), int(np.count_nonzero(limited[begun:] == 2))
+            if held >= HELD_SAMPLES:
+                unusable[name] = f"the voltage is held at a limit at {held} of its samples"
+            elif slow >= HELD_SAMPLES:
+                unusable[name] = f"slew_limit holds the voltage back at {slow} of its samples"
+        followed = {name: y + self.correction[name] for name, y in path.desired.items()}
+        return FinishedPass(path, followed, measured, voltage, unusable, dropped)
+
+    def _late(self, output: FloatArray) -> Mask:
+        """Return the samples, (N,), that were output late or follow such ones."""
+        t, lost = self.path.t, np.zeros(self.path.t.size, dtype=np.bool_)
+        longest = max(LATE, LATE_PERIODS * self.period)
+        edges = np.concatenate([[min(0.0, output[0])], output, [max(t[-1], output[-1])]])
+        for k in np.flatnonzero(np.diff(edges) > longest):
+            lost |= (t > edges[k]) & (t <= edges[k + 1] + RECOVERED)
+        return lost
+
+
+class PathPasses:
+    """Recognise paths that come again, and record their passes; times in ns on the clock of trajectories."""
+
+    def __init__(self) -> None:
+        self.corrections: dict[str, Mapping[str, FloatArray]] = {}  # m, by identity of the path and axis
+        self.dropped = ""  # why the last pass that was dropped was
+        self._seen: dict[str, FinishedPass | None] = {}  # the first pass of a path that has come once
+        self._recorders: list[PassRecorder] = []
+
+    @property
+    def on(self) -> bool:
+        """Whether a pass of a path is followed, or awaited."""
+        return bool(self._recorders)
+
+    def begin(self, path: SampledPath, start_ns: int, now_ns: int, period: float, learns: bool) -> None:
+        """Begin a pass of a trajectory that was accepted at `now_ns` and starts at `start_ns`, 0: at once.
+
+        Without `learns` it is followed with what is known, and tells nothing.
+        """
+        begin_ns = (start_ns or now_ns) + round(path.start * SECOND_NS)
+        self.end(start_ns or now_ns)
+        learns = learns and (now_ns - begin_ns) * 1e-9 <= MOST_LATE * float(path.t[-1])
+        correction = self.corrections.get(path.identity, {})
+        self._recorders.append(PassRecorder(path, begin_ns, correction, period, learns))
+
+    def end(self, at_ns: int) -> None:
+        """Nothing more is output from `at_ns` on: the passes that have not ended by then tell nothing."""
+        self._recorders = [one for one in self._recorders if one.end_ns <= at_ns + SECOND_NS // 1000]
+
+    def read(self, names: Sequence[str], readings: Sequence[float], at_ns: int) -> None:
+        """Take readings (m) of sensors."""
+        for recorder in self._recorders:
+            for name, reading in zip(names, readings, strict=False):
+                recorder.read(name, reading, at_ns)
+
+    def output(self, axes: Iterable[Axis], at_ns: int) -> None:
+        """Take what has been output."""
+        for recorder in self._recorders:
+            if recorder.begin_ns <= at_ns <= recorder.end_ns + SECOND_NS // 1000:
+                recorder.output(axes, at_ns)
+
+    def take(self, now_ns: int) -> list[FinishedPass]:
+        """Return the passes of paths that come again which have ended, in order."""
+        ready: list[FinishedPass] = []
+        ended = [one for one in self._recorders if one.end_ns + LAST_READING_NS < now_ns]
+        for recorder in ended:
+            self._recorders.remove(recorder)
+            if not recorder.learns:
+                continue
+            done = recorder.finished()
+            if done.dropped:
+                self.dropped = done.dropped
+                continue
+            ready += self._again(done)
+        return ready
+
+    def _again(self, done: FinishedPass) -> list[FinishedPass]:
+        """Return the pass, and the first one of its path before the second; nothing while it has come once."""
+        identity = done.path.identity
+        if identity in self.corrections:
+            return [done]
+        if identity in self._seen:
+            first, self._seen[identity] = self._seen[identity], None
+            return [done] if first is None else [first, done]
+        # Of paths that came once, the readings of the last one only are kept.
+        self._seen = dict.fromkeys([*self._seen][-KNOWN_PATHS:]) | {identity: done}
+        return []
+
+    def forget(self) -> None:
+        """Begin anew, from the desired paths."""
+        self.corrections.clear()
+        self._seen.clear()
+        self._recorders.clear()
+        self.dropped = ""
+
+
+def _at(t: FloatArray, at: FloatArray, readings: FloatArray, interval: float) -> FloatArray:
+    """Return readings (m) at times (s, (N,)); NaN in gaps and beyond the first and the last one."""
+    order = np.argsort(at, kind="stable")
+    at, readings = at[order], readings[order]
+    if at.size < 2:
+        return np.full(t.size, np.nan)
+    longest = GAP * max(interval, float(np.median(np.diff(at))))
+    after = np.clip(np.searchsorted(at, t), 1, at.size - 1)
+    gap = (at[after] - at[after - 1] > longest) | (t < at[0] - longest) | (t > at[-1] + longest)
+    return np.where(gap, np.nan, np.interp(t, at, readings))

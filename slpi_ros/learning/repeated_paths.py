@@ -1,0 +1,198 @@
+"""Paths that come again and again: what is learned of each of them, kept in files; for a worker process."""
+
+import glob
+import os
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from slpi_ros.arrays import FloatArray, IntArray
+from slpi_ros.errors import SlpiError
+from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.learning.axis_learner import AxisLearner
+from slpi_ros.learning.learner import FEWEST, Learner, path_identity, read_learned
+from slpi_ros.model.stage_model import StageModel
+
+# Most samples of a pass that are learned; a longer one is learned at longer intervals.
+MOST_SAMPLES = 20_000
+# Paths that are learned at the same time, and files that are kept; those that came last.
+MOST_PATHS = 16
+# Digits of the identity of a path in the name of its file.
+DIGITS = 12
+
+
+@dataclass(frozen=True)
+class SampledPath:
+    """A desired path at even times; `identity` is the same whenever the same path is sent."""
+
+    identity: str
+    start: float  # s, of the first sample from the begin of the trajectory
+    interval: float  # s
+    desired: Mapping[str, FloatArray]  # m, (N,), by axis
+
+    @classmethod
+    def of(
+        cls, names: Sequence[str], time_from_start_ns: ArrayLike, positions: ArrayLike, period: float
+    ) -> "SampledPath | None":
+        """Return the path of a valid trajectory, sampled at the output `period` (s); None if it is too short."""
+        times, places = np.asarray(time_from_start_ns), np.asarray(positions, dtype=np.float64)
+        duration = float(times[-1] - times[0]) / SECOND_NS
+        steps = min(round(duration / period), MOST_SAMPLES - 1)
+        if steps < FEWEST - 1:
+            return None
+        interval = round(duration / steps, 12)
+        t, own = np.arange(steps + 1, dtype=np.float64) * interval, (times - times[0]) / SECOND_NS
+        desired = {name: np.interp(t, own, places[:, column]) for column, name in enumerate(names)}
+        return cls(path_identity(t, desired), float(times[0]) / SECOND_NS, interval, desired)
+
+    @property
+    def t(self) -> FloatArray:
+        """Times of the samples from the first one, (N,), seconds."""
+        size = next(iter(self.desired.values())).size
+        return np.asarray(np.arange(size, dtype=np.float64) * self.interval)
+
+    def corrected(
+        self, correction: Mapping[str, FloatArray], period: float
+    ) -> tuple[Sequence[str], IntArray, FloatArray]:
+        """Return names, times (ns, (N,)) and positions (m, (N, K)) of the path with a correction (m, by axis)."""
+        t = self.t
+        count = max(t.size - 1, round(float(t[-1]) / period))
+        at = np.linspace(0.0, float(t[-1]), count + 1)
+        names = list(self.desired)
+        columns = [np.interp(at, t, self.desired[name] + correction.get(name, 0.0)) for name in names]
+        times = np.round((self.start + at) * SECOND_NS).astype(np.int64)
+        return names, times, np.column_stack(columns)
+
+
+@dataclass(frozen=True)
+class FinishedPass:
+    """A pass that was followed to its end: what was desired, asked for and measured, m, (N,), by axis."""
+
+    path: SampledPath
+    followed: Mapping[str, FloatArray]
+    measured: Mapping[str, FloatArray]  # NaN: no reading
+    voltage: Mapping[str, FloatArray]  # V
+    unusable: Mapping[str, str] = field(default_factory=dict)  # why it is not learned from, by axis
+    dropped: str = ""  # why it tells nothing of any axis
+
+
+@dataclass(frozen=True)
+class AxisProgress:
+    """What has become of one axis: passes, the error (m, rms without mean and drift) of the last, first and best one.
+
+    `reason`: what was made of the last pass, "" if it was learned from; `limited_by`: what keeps the error where it is.
+    """
+
+    passes: int
+    error: float
+    first: float
+    best: float
+    limited_by: str
+    reason: str
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What is known of a path: the correction (m, (N,), by axis) of its next pass, and how it has come to it."""
+
+    identity: str
+    correction: Mapping[str, FloatArray]
+    axes: Mapping[str, AxisProgress]
+    remarks: tuple[str, ...] = ()
+
+
+class RepeatedPaths:
+    """Learns every path that it is given passes of; what was learned is kept in files that begin with `prefix`.
+
+    Parameters
+    ----------
+    model : StageModel
+        The model with which the paths are compensated.
+    prefix : str
+        Begin of the files' names, with their folder; "": nothing is kept.
+    limit : mapping of axis name to float, or None, metres
+        Most that learning may add to a desired path; None: a quarter of each axis's stroke.
+    """
+
+    def __init__(self, model: StageModel, prefix: str = "", limit: Mapping[str, float] | None = None) -> None:
+        self.model, self.prefix, self.limit = model, prefix, limit
+        self._learners: dict[str, Learner] = {}
+
+    def load(self) -> list[Learned]:
+        """Go on from the kept files of this stage; those of others are left alone, which is said in a remark."""
+        found: list[Learned] = []
+        for file in reversed(kept_files(self.prefix)[:MOST_PATHS]):
+            try:
+                document = read_learned(file)
+                axes = document["axes"]
+                desired = {name: np.array(one["desired_m"]) for name, one in axes.items()}
+                size = next(iter(desired.values())).size
+                t = np.arange(size, dtype=np.float64) * float(document["interval_s"])
+                learner = Learner(self.model, t, desired, learn_limit=self.limit)
+                remarks = learner.resume(document, str(file))
+            except SlpiError as error:
+                found.append(Learned("", {}, {}, (f"learned afresh: {error}",)))
+                continue
+            self._learners[document["path"]] = learner
+            found.append(_learned(document["path"], learner, tuple(remarks)))
+        return found
+
+    def learn(self, done: FinishedPass) -> Learned:
+        """Learn from a pass, and keep what was learned."""
+        path, remarks = done.path, []
+        learner = self._learners.pop(path.identity, None)
+        try:
+            if learner is None:
+                learner = Learner(self.model, path.t, path.desired, learn_limit=self.limit)
+            learner.update(
+                done.measured,
+                {name: v for name, v in done.voltage.items() if np.isfinite(v).all()},
+                followed=done.followed,
+                unusable=done.unusable,
+            )
+        except SlpiError as error:
+            return Learned(path.identity, {}, {}, (f"not learned: {error}",))
+        self._learners[path.identity] = learner
+        for old in [*self._learners][:-MOST_PATHS]:
+            del self._learners[old]
+        if self.prefix:
+            try:
+                learner.save(f"{self.prefix}.{path.identity[:DIGITS]}.json")
+                for file in kept_files(self.prefix)[MOST_PATHS:]:
+                    file.unlink(missing_ok=True)
+            except (SlpiError, OSError) as error:
+                remarks.append(f"what was learned cannot be kept: {error}")
+        return _learned(path.identity, learner, tuple(remarks))
+
+    def forget(self) -> int:
+        """Begin anew from the desired paths, and remove the files; return how many paths were learned."""
+        files = kept_files(self.prefix)
+        count = max(len(self._learners), len(files))
+        self._learners.clear()
+        for file in files:
+            file.unlink(missing_ok=True)
+        return count
+
+
+def kept_files(prefix: str) -> list[Path]:
+    """Return the files of what was learned whose names begin with `prefix`, the newest first."""
+    if not prefix:
+        return []
+    folder, name = os.path.split(prefix)
+    found = Path(folder or ".").glob(f"{glob.escape(name)}.{'?' * DIGITS}.json")
+    return sorted(found, key=lambda each: each.stat().st_mtime, reverse=True)
+
+
+def _learned(identity: str, learner: Learner, remarks: tuple[str, ...]) -> Learned:
+    correction = {name: axis.path - axis.desired for name, axis in learner.axes.items()}
+    progress = {name: _progress(axis) for name, axis in learner.axes.items() if axis.passes}
+    return Learned(identity, correction, progress, remarks)
+
+
+def _progress(axis: AxisLearner) -> AxisProgress:
+    last, errors = axis.passes[-1], [one.error for one in axis.passes if one.learned]
+    first, best = (errors[0], min(errors)) if errors else (last.error, last.error)
+    return AxisProgress(last.number, last.error, first, best, last.limited_by, last.reason)

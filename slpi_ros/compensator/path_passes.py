@@ -187,4 +187,5 @@ def _at(t: FloatArray, at: FloatArray, readings: FloatArray, interval: float) ->
     longest = GAP * max(interval, float(np.median(np.diff(at))))
     after = np.clip(np.searchsorted(at, t), 1, at.size - 1)
     gap = (at[after] - at[after - 1] > longest) | (t < at[0] - longest) | (t > at[-1] + longest)
+    gap &= np.minimum(np.abs(t - at[after - 1]), np.abs(at[after] - t)) > 0.5 * interval
     return np.where(gap, np.nan, np.interp(t, at, readings))

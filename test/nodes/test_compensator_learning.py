@@ -71,7 +71,9 @@ class Passes:
         for _ in range(count):
             self.sent += 1
             before = len(self._client.reports)
-            self._publisher.publish(trajectory(["x"], np.arange(SAMPLES) * round(1000 / RATE) * MS, self._path[:, None]))
+            self._publisher.publish(
+                trajectory(["x"], np.arange(SAMPLES) * round(1000 / RATE) * MS, self._path[:, None])
+            )
             self._client.graph.spin_for(SAMPLES / RATE + 0.35)
             reports = self._client.reports[before:]
             told.append(reports[-1] if reports else {})

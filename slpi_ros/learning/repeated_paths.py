@@ -5,6 +5,7 @@ import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -127,18 +128,27 @@ class RepeatedPaths:
         for file in reversed(kept_files(self.prefix)[:MOST_PATHS]):
             try:
                 document = read_learned(file)
-                axes = document["axes"]
-                desired = {name: np.array(one["desired_m"]) for name, one in axes.items()}
-                size = next(iter(desired.values())).size
-                t = np.arange(size, dtype=np.float64) * float(document["interval_s"])
-                learner = Learner(self.model, t, desired, learn_limit=self.limit)
-                remarks = learner.resume(document, str(file))
             except SlpiError as error:
-                found.append(Learned("", {}, {}, (f"learned afresh: {error}",)))
+                found.append(_afresh(error))
                 continue
-            self._learners[document["path"]] = learner
-            found.append(_learned(document["path"], learner, tuple(remarks)))
+            if document["path"] not in self._learners:
+                found.append(self._resume(document, str(file)))
         return found
+
+    def take_over(self, before: "RepeatedPaths") -> list[Learned]:
+        """Go on with what was learned with another model or limit."""
+        return [self._resume(one.to_document(), "what was learned") for one in before._learners.values()]
+
+    def _resume(self, document: Mapping[str, Any], source: str) -> Learned:
+        desired = {name: np.array(one["desired_m"]) for name, one in document["axes"].items()}
+        t = np.arange(next(iter(desired.values())).size, dtype=np.float64) * float(document["interval_s"])
+        try:
+            learner = Learner(self.model, t, desired, learn_limit=self.limit)
+            remarks = learner.resume(document, source)
+        except SlpiError as error:
+            return _afresh(error)
+        self._learners[document["path"]] = learner
+        return _learned(document["path"], learner, tuple(remarks))
 
     def learn(self, done: FinishedPass) -> Learned:
         """Learn from a pass, and keep what was learned."""
@@ -184,6 +194,10 @@ def kept_files(prefix: str) -> list[Path]:
     folder, name = os.path.split(prefix)
     found = Path(folder or ".").glob(f"{glob.escape(name)}.{'?' * DIGITS}.json")
     return sorted(found, key=lambda each: each.stat().st_mtime, reverse=True)
+
+
+def _afresh(error: SlpiError) -> Learned:
+    return Learned("", {}, {}, (f"learned afresh: {error}",))
 
 
 def _learned(identity: str, learner: Learner, remarks: tuple[str, ...]) -> Learned:

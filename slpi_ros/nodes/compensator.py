@@ -337,13 +337,12 @@ class Compensator(LifecycleNode):
 
     def _on_measured(self, data: bytes) -> None:
         stamp_ns, names, displacements = self._measured.read(data) or as_rclpy_reads(data)
-        time_ns, now_ns = self.get_clock().now().nanoseconds, time.monotonic_ns()
-        fresh = not stamp_ns or -EARLIEST_NS <= time_ns - stamp_ns <= OLDEST_NS
+        age_ns = self.get_clock().now().nanoseconds - stamp_ns if stamp_ns else 0
+        fresh = -EARLIEST_NS <= age_ns <= OLDEST_NS
         if self._learning.passes.on and fresh:
-            clock_ns = time_ns if self._simulated else now_ns
-            self._learning.passes.read(names, displacements, clock_ns + (stamp_ns - time_ns if stamp_ns else 0))
+            self._learning.passes.read(names, displacements, self._clocks()[1] - age_ns)
         try:
-            self._controller.measure(names, displacements, now_ns, fresh)
+            self._controller.measure(names, displacements, time.monotonic_ns(), fresh)
         except RejectedError as error:
             self._reject("measurement ", error)
 
@@ -655,6 +654,7 @@ class Compensator(LifecycleNode):
 
     def _watch(self) -> None:
         controller, values, now_ns = self._controller, self._settings.values, time.monotonic_ns()
+        self._watch_learning()
         if not controller.active:
             return
         self._work_off()
@@ -677,7 +677,6 @@ class Compensator(LifecycleNode):
         if values["rearm"] and controller.rearm(now_ns):
             self.get_logger().warning(f"rearmed at {volts(*controller.voltages)} V")
             self._report()
-        self._watch_learning()
         self._publish_tracking_errors()
 
     def _watch_learning(self) -> None:

@@ -60,8 +60,9 @@ def serve(connection: Connection) -> None:
             return
         answer: list[Learned] | int
         if isinstance(request, Opening):
+            before = paths
             paths = RepeatedPaths(parse_model(request.document, "the model"), request.prefix, request.limit)
-            answer = paths.load()
+            answer = [*paths.take_over(before), *paths.load()]
         elif isinstance(request, FinishedPass):
             answer = [paths.learn(request)]
         else:
@@ -108,6 +109,9 @@ class PathLearning:
 
     def use_model(self, model: StageModel | None) -> None:
         """Take another model: what was learned with the last one is learned afresh."""
+        if self._model is not None and model is not None and model.hardware_id != self._model.hardware_id:
+            # Those of another stage.
+            self.passes.corrections.clear()
         self._model = model
         if self.mode != OFF:
             self._open()

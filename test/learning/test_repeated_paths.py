@@ -65,7 +65,11 @@ def test_another_model_and_another_stage(model, tmp_path):
     run(RepeatedPaths(model, prefix), way, Stage(way.desired["x"][0]), 6)
     axis = model.axes["x"]
     other = replace(model, axes={"x": replace(axis, quality=replace(axis.quality, held_out_rms=9e-9))})
-    (found,) = RepeatedPaths(other, prefix).load()
+    before = RepeatedPaths(model, prefix)
+    before.load()
+    # From the file, and from what another model has learned in this process.
+    (found,), (same,) = RepeatedPaths(other, prefix).load(), RepeatedPaths(other).take_over(before)
+    assert same.remarks == found.remarks and same.correction["x"] == pytest.approx(found.correction["x"], abs=1e-15)
     assert found.remarks == ("axis 'x': another model; learned anew, from the correction of the path so far",)
     assert np.ptp(found.correction["x"]) > 50e-9 and not found.axes
     (found,) = RepeatedPaths(replace(model, hardware_id="two"), prefix).load()

@@ -21,6 +21,8 @@ GAP = 3.0
 LATE, LATE_PERIODS, RECOVERED, MOST_LATE = 0.01, 5.0, 0.01, 0.1
 # Samples in a row that a limit held back in the midst of a pass, from which it is not learned from.
 HELD_SAMPLES = 3
+# Of more passes in a row than these, the first one is left out.
+FIRST_LEFT_OUT = 2
 
 
 class PassRecorder:
@@ -31,14 +33,14 @@ class PassRecorder:
         self, path: SampledPath, begin_ns: int, correction: Mapping[str, FloatArray], period: float, learns: bool = True
     ) -> None:
         self.path, self.begin_ns, self.period, self.learns = path, begin_ns, period, learns
-        self.correction = {name: np.asarray(correction.get(name, 0.0) + 0.0 * y) for name, y in path.desired.items()}
-        self.end_ns = begin_ns + round(float(path.t[-1]) * SECOND_NS)
+        self._correction, self._t = path.over_whole(correction), path.t_whole
+        self.end_ns = begin_ns + round(float(self._t[-1]) * SECOND_NS)
         self._read: dict[str, tuple[array[float], array[float]]] = {
             name: (array("d"), array("d")) for name in path.desired
         }
         # Time (s), voltage (V), 1 where a voltage limit or 2 where the slew limit holds back.
         self._output: dict[str, tuple[array[float], array[float], array[int]]] = {
-            name: (array("d"), array("d"), array("b")) for name in path.desired
+            name: (array("d"), array("d"), array("b")) for name in path.whole
         }
 
     def read(self, name: str, reading: float, at_ns: int) -> None:
@@ -51,31 +53,35 @@ class PassRecorder:
     def output(self, axes: Iterable[Axis], at_ns: int) -> None:
         """Take what has been output at `at_ns`, and tell each axis how much of its setpoint was learned."""
         at = (at_ns - self.begin_ns) * 1e-9
-        place = min(max(int(at / self.path.interval + 0.5), 0), self.path.t.size - 1)
+        place = min(max(int(at / self.path.interval + 0.5), 0), self._t.size - 1)
         for axis in axes:
             kept = self._output.get(axis.name)
             if kept is not None:
                 kept[0].append(at)
                 kept[1].append(axis.voltage)
                 kept[2].append(1 if axis.held else 2 if axis.slewing else 0)
-                axis.tracking.learned = float(self.correction[axis.name][place])
+                axis.tracking.learned = float(self._correction[axis.name][place])
 
-    def finished(self) -> FinishedPass:
-        """Return what the pass says."""
-        t, path = self.path.t, self.path
+    def finished(self) -> list[FinishedPass]:
+        """Return what each pass says, in order; of several, not the first one, which comes from elsewhere."""
+        size, path = self.path.t.size, self.path
+        first = 1 if path.count > FIRST_LEFT_OUT else 0
+        return [self._finished(slice(k * size, (k + 1) * size)) for k in range(first, path.count)]
+
+    def _finished(self, part: slice) -> FinishedPass:
+        t, path = self._t[part], self.path
         measured, voltage, unusable, dropped = {}, {}, {}, ""
-        for name, desired in path.desired.items():
+        for name in path.desired:
             out_t, out_v, limited = (np.array(each) for each in self._output[name])
             at, readings = (np.array(each) for each in self._read[name])
             reading = _at(t, at, readings, path.interval)
             if not out_t.size:
                 dropped = "it was not output"
-                measured[name], voltage[name] = reading, np.full(desired.size, np.nan)
+                measured[name], voltage[name] = reading, np.full(t.size, np.nan)
                 continue
-            lost = self._late(out_t)
+            lost, latest = self._late(t, out_t)
             if float(np.mean(lost)) > MOST_LATE:
-                longest = float(np.max(np.diff(np.concatenate([[0.0], out_t, [t[-1]]]))))
-                dropped = f"the computer was busy: the path was output up to {longest * 1e3:.3g} ms late"
+                dropped = f"the computer was busy: the path was output up to {latest * 1e3:.3g} ms late"
             # On the way to a path that begins elsewhere, the slew limit holds back; that is no part of the pass.
             begun = int(np.argmin(limited == 2)) if (limited != 2).any() else limited.size - 1
             lost |= t < out_t[begun] if begun else lost
@@ -84,22 +90,24 @@ class PassRecorder:
             if missing > MOST_LATE and not dropped:
                 dropped = f"axis '{name}': {100 * missing:.0f} % of its samples have no reading"
             voltage[name] = np.interp(t, out_t, out_v)
-            held, slow = int(np.count_nonzero(limited == 1)), int(np.count_nonzero(limited[begun:] == 2))
+            within = (out_t >= max(t[0], out_t[begun])) & (out_t <= t[-1])
+            held, slow = (int(np.count_nonzero(limited[within] == kind)) for kind in (1, 2))
             if held >= HELD_SAMPLES:
                 unusable[name] = f"the voltage is held at a limit at {held} of its samples"
             elif slow >= HELD_SAMPLES:
                 unusable[name] = f"slew_limit holds the voltage back at {slow} of its samples"
-        followed = {name: y + self.correction[name] for name, y in path.desired.items()}
+        followed = {name: y + self._correction[name][part] for name, y in path.desired.items()}
         return FinishedPass(path, followed, measured, voltage, unusable, dropped)
 
-    def _late(self, output: FloatArray) -> Mask:
-        """Return the samples, (N,), that were output late or follow such ones."""
-        t, lost = self.path.t, np.zeros(self.path.t.size, dtype=np.bool_)
-        longest = max(LATE, LATE_PERIODS * self.period)
-        edges = np.concatenate([[min(0.0, output[0])], output, [max(t[-1], output[-1])]])
+    def _late(self, t: FloatArray, output: FloatArray) -> tuple[Mask, float]:
+        """Return which samples at `t` (s, (N,)) were output late or follow such ones, and by how much (s) at most."""
+        lost, latest, longest = np.zeros(t.size, dtype=np.bool_), 0.0, max(LATE, LATE_PERIODS * self.period)
+        edges = np.concatenate([[min(0.0, output[0])], output, [max(self._t[-1], output[-1])]])
         for k in np.flatnonzero(np.diff(edges) > longest):
-            lost |= (t > edges[k]) & (t <= edges[k + 1] + RECOVERED)
-        return lost
+            late = (t > edges[k]) & (t <= edges[k + 1] + RECOVERED)
+            if late.any():
+                lost, latest = lost | late, max(latest, float(edges[k + 1] - edges[k]))
+        return lost, latest
 
 
 class PathPasses:
@@ -123,7 +131,7 @@ class PathPasses:
         """
         begin_ns = (start_ns or now_ns) + round(path.start * SECOND_NS)
         self.end(start_ns or now_ns)
-        learns = learns and (now_ns - begin_ns) * 1e-9 <= MOST_LATE * float(path.t[-1])
+        learns = learns and (now_ns - begin_ns) * 1e-9 <= MOST_LATE * float(path.t_whole[-1])
         correction = self.corrections.get(path.identity, {})
         self._recorders.append(PassRecorder(path, begin_ns, correction, period, learns))
 
@@ -151,11 +159,11 @@ class PathPasses:
             self._recorders.remove(recorder)
             if not recorder.learns:
                 continue
-            done = recorder.finished()
-            if done.dropped:
-                self.dropped = done.dropped
-                continue
-            ready += self._again(done)
+            for done in recorder.finished():
+                if done.dropped:
+                    self.dropped = done.dropped
+                else:
+                    ready += self._again(done)
         return ready
 
     def _again(self, done: FinishedPass) -> list[FinishedPass]:

@@ -140,12 +140,20 @@ class AxisLearner:
 
     @property
     def path(self) -> FloatArray:
-        """The desired path of the next pass, (N,), metres."""
-        low, high = self.axis.displacement_range
-        low, high = min(low, float(self.desired.min())), max(high, float(self.desired.max()))
+        """The desired path of the next pass, (N,), metres: a change of `aim` comes in without a jump."""
         correction = self.correction
         if self.closed:
             correction = self._before + self._onset * (correction - self._before)
+        return self._within_range(correction)
+
+    @property
+    def aim(self) -> FloatArray:
+        """The desired path of the passes after the next one, (N,), metres."""
+        return self._within_range(self.correction)
+
+    def _within_range(self, correction: FloatArray) -> FloatArray:
+        low, high = self.axis.displacement_range
+        low, high = min(low, float(self.desired.min())), max(high, float(self.desired.max()))
         return np.asarray(np.clip(self.desired + correction, low, high))
 
     @property

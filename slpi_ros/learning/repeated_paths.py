@@ -21,51 +21,106 @@ from slpi_ros.model.stage_model import StageModel
 MOST_SAMPLES = 20_000
 # Paths that are learned at the same time, and files that are kept; those that came last.
 MOST_PATHS = 16
+# A path that repeats has at least so many periods, which differ by at most this share of what they cover.
+LEAST_PERIODS, SAME_SHARE = 2, 0.01
 # Digits of the identity of a path in the name of its file.
 DIGITS = 12
 
 
 @dataclass(frozen=True)
 class SampledPath:
-    """A desired path at even times; `identity` is the same whenever the same path is sent."""
+    """A desired path at even times, and what of it is learned: the whole of it, or a period that comes again in it.
+
+    `identity` is the same whenever the same path, or the same period, is sent.
+    """
 
     identity: str
     start: float  # s, of the first sample from the begin of the trajectory
     interval: float  # s
-    desired: Mapping[str, FloatArray]  # m, (N,), by axis
+    whole: Mapping[str, FloatArray]  # m, (M,), by axis
+    desired: Mapping[str, FloatArray]  # m, (N,), by axis that is learned: of one pass
+    count: int = 1  # passes, one after the other
 
     @classmethod
     def of(
-        cls, names: Sequence[str], time_from_start_ns: ArrayLike, positions: ArrayLike, period: float
+        cls,
+        names: Sequence[str],
+        time_from_start_ns: ArrayLike,
+        positions: ArrayLike,
+        output_period: float,
+        learn_period: float = 0.0,
     ) -> "SampledPath | None":
-        """Return the path of a valid trajectory, sampled at the output `period` (s); None if it is too short."""
+        """Return the path of a valid trajectory, sampled at the output period (s); None if it is too short.
+
+        Axes that repeat with `learn_period` (s) are learned period by period, if any do; otherwise, and with 0, all of
+        them as a whole.
+        """
         times, places = np.asarray(time_from_start_ns), np.asarray(positions, dtype=np.float64)
-        duration = float(times[-1] - times[0]) / SECOND_NS
-        steps = min(round(duration / period), MOST_SAMPLES - 1)
+        start, own = float(times[0]) / SECOND_NS, (times - times[0]) / SECOND_NS
+        duration = float(own[-1])
+        samples = min(round(learn_period / output_period), MOST_SAMPLES)
+        if samples >= FEWEST:
+            interval = round(learn_period / samples, 12)
+            count = int((duration + interval) / learn_period + 1e-6)
+            whole = _sampled(names, own, places, interval, round(duration / interval))
+            desired = {name: y[:samples] for name, y in whole.items() if _repeats(y, samples, count)}
+            if desired:
+                identity = path_identity(_times(samples, interval), desired)
+                return cls(identity, start, interval, whole, desired, count)
+        steps = min(round(duration / output_period), MOST_SAMPLES - 1)
         if steps < FEWEST - 1:
             return None
         interval = round(duration / steps, 12)
-        t, own = np.arange(steps + 1, dtype=np.float64) * interval, (times - times[0]) / SECOND_NS
-        desired = {name: np.interp(t, own, places[:, column]) for column, name in enumerate(names)}
-        return cls(path_identity(t, desired), float(times[0]) / SECOND_NS, interval, desired)
+        whole = _sampled(names, own, places, interval, steps)
+        return cls(path_identity(_times(steps + 1, interval), whole), start, interval, whole, whole)
 
     @property
     def t(self) -> FloatArray:
-        """Times of the samples from the first one, (N,), seconds."""
-        size = next(iter(self.desired.values())).size
-        return np.asarray(np.arange(size, dtype=np.float64) * self.interval)
+        """Times of the samples of one pass, (N,), seconds."""
+        return _times(next(iter(self.desired.values())).size, self.interval)
+
+    @property
+    def t_whole(self) -> FloatArray:
+        """Times of all samples, (M,), seconds."""
+        return _times(next(iter(self.whole.values())).size, self.interval)
+
+    def over_whole(self, correction: Mapping[str, FloatArray]) -> dict[str, FloatArray]:
+        """Return the correction of a pass (m, (N,), by axis) for all samples, (M,), and all axes."""
+        return {
+            name: np.resize(correction[name], y.size) if name in correction else np.zeros(y.size)
+            for name, y in self.whole.items()
+        }
 
     def corrected(
-        self, correction: Mapping[str, FloatArray], period: float
+        self, correction: Mapping[str, FloatArray], output_period: float
     ) -> tuple[Sequence[str], IntArray, FloatArray]:
-        """Return names, times (ns, (N,)) and positions (m, (N, K)) of the path with a correction (m, by axis)."""
-        t = self.t
-        count = max(t.size - 1, round(float(t[-1]) / period))
+        """Return names, times (ns, (M,)) and positions (m, (M, K)) of the path with a correction (m, (N,), by axis)."""
+        t, added = self.t_whole, self.over_whole(correction)
+        count = max(t.size - 1, round(float(t[-1]) / output_period))
         at = np.linspace(0.0, float(t[-1]), count + 1)
-        names = list(self.desired)
-        columns = [np.interp(at, t, self.desired[name] + correction.get(name, 0.0)) for name in names]
+        columns = [np.interp(at, t, y + added[name]) for name, y in self.whole.items()]
         times = np.round((self.start + at) * SECOND_NS).astype(np.int64)
-        return names, times, np.column_stack(columns)
+        return list(self.whole), times, np.column_stack(columns)
+
+
+def _times(size: int, interval: float) -> FloatArray:
+    return np.asarray(np.arange(size, dtype=np.float64) * interval)
+
+
+def _sampled(
+    names: Sequence[str], own: FloatArray, places: FloatArray, interval: float, steps: int
+) -> dict[str, FloatArray]:
+    t = _times(steps + 1, interval)
+    return {name: np.interp(t, own, places[:, column]) for column, name in enumerate(names)}
+
+
+def _repeats(y: FloatArray, samples: int, count: int) -> bool:
+    """Return whether a path (m, (M,)) moves, and repeats after so many samples, at least twice."""
+    if count < LEAST_PERIODS or y.size < samples * count:
+        return False
+    periods = y[: samples * count].reshape(count, samples)
+    span = float(np.ptp(periods[0]))
+    return span > 0.0 and float(np.abs(periods - periods[0]).max()) <= SAME_SHARE * span
 
 
 @dataclass(frozen=True)
@@ -77,7 +132,7 @@ class FinishedPass:
     measured: Mapping[str, FloatArray]  # NaN: no reading
     voltage: Mapping[str, FloatArray]  # V
     unusable: Mapping[str, str] = field(default_factory=dict)  # why it is not learned from, by axis
-    dropped: str = ""  # why it tells nothing of any axis
+    dropped: str = ""  # why it tells nothing
 
 
 @dataclass(frozen=True)
@@ -150,32 +205,42 @@ class RepeatedPaths:
         self._learners[document["path"]] = learner
         return _learned(document["path"], learner, tuple(remarks))
 
-    def learn(self, done: FinishedPass) -> Learned:
-        """Learn from a pass, and keep what was learned."""
-        path, remarks = done.path, []
-        learner = self._learners.pop(path.identity, None)
-        try:
-            if learner is None:
-                learner = Learner(self.model, path.t, path.desired, learn_limit=self.limit)
-            learner.update(
-                done.measured,
-                {name: v for name, v in done.voltage.items() if np.isfinite(v).all()},
-                followed=done.followed,
-                unusable=done.unusable,
-            )
-        except SlpiError as error:
-            return Learned(path.identity, {}, {}, (f"not learned: {error}",))
-        self._learners[path.identity] = learner
+    def learn(self, *passes: FinishedPass) -> list[Learned]:
+        """Learn from passes, and keep what was learned; return what is known of each of their paths."""
+        remarks: dict[str, list[str]] = {}
+        periodic = {done.path.identity: done.path.count > 1 for done in passes}
+        for done in passes:
+            path = done.path
+            told = remarks.setdefault(path.identity, [])
+            learner = self._learners.pop(path.identity, None)
+            voltage = {name: v for name, v in done.voltage.items() if np.isfinite(v).all()}
+            try:
+                if learner is None:
+                    learner = Learner(self.model, path.t, path.desired, learn_limit=self.limit)
+                learner.update(done.measured, voltage, followed=done.followed, unusable=done.unusable)
+            except SlpiError as error:
+                told.append(f"not learned: {error}")
+                continue
+            self._learners[path.identity] = learner
         for old in [*self._learners][:-MOST_PATHS]:
             del self._learners[old]
+        return [
+            _learned(identity, self._learners[identity], (*told, *self._keep(identity)), periodic[identity])
+            if identity in self._learners
+            else Learned("", {}, {}, tuple(told))
+            for identity, told in remarks.items()
+        ]
+
+    def _keep(self, identity: str) -> list[str]:
+        """Write the file of a path; return why that is not possible."""
         if self.prefix:
             try:
-                learner.save(f"{self.prefix}.{path.identity[:DIGITS]}.json")
+                self._learners[identity].save(f"{self.prefix}.{identity[:DIGITS]}.json")
                 for file in kept_files(self.prefix)[MOST_PATHS:]:
                     file.unlink(missing_ok=True)
             except (SlpiError, OSError) as error:
-                remarks.append(f"what was learned cannot be kept: {error}")
-        return _learned(path.identity, learner, tuple(remarks))
+                return [f"what was learned cannot be kept: {error}"]
+        return []
 
     def forget(self) -> int:
         """Begin anew from the desired paths, and remove the files; return how many paths were learned."""
@@ -200,8 +265,10 @@ def _afresh(error: SlpiError) -> Learned:
     return Learned("", {}, {}, (f"learned afresh: {error}",))
 
 
-def _learned(identity: str, learner: Learner, remarks: tuple[str, ...]) -> Learned:
-    correction = {name: axis.path - axis.desired for name, axis in learner.axes.items()}
+def _learned(identity: str, learner: Learner, remarks: tuple[str, ...], periodic: bool = False) -> Learned:
+    # A change comes in over one pass; in a path of many periods it would in each of them.
+    paths = {name: axis.aim if periodic else axis.path for name, axis in learner.axes.items()}
+    correction = {name: paths[name] - axis.desired for name, axis in learner.axes.items()}
     progress = {name: _progress(axis) for name, axis in learner.axes.items() if axis.passes}
     return Learned(identity, correction, progress, remarks)
 

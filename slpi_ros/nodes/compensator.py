@@ -168,8 +168,9 @@ class Compensator(LifecycleNode):
         self._use_learning(new)
 
     def _use_learning(self, settings: CompensatorSettings) -> None:
-        axes, limits = settings.values["axes"], settings.values["learn_limit"]
-        self._learning.use(settings.values["learn"], dict(zip(axes, limits, strict=True)) if limits else None)
+        values, limits = settings.values, settings.values["learn_limit"]
+        most = dict(zip(values["axes"], limits, strict=True)) if limits else None
+        self._learning.use(values["learn"], most, values["learn_period"])
 
     # Lifecycle
 

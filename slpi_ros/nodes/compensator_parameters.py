@@ -189,6 +189,12 @@ DECLARATIONS = (
         "(what was learned is used, and no more is learned). Kept in files beside memory_file.",
         "off", "on", "hold",
     ),
+    scalar(
+        "learn_period", 0.0,
+        "Period of the axes that repeat within a trajectory, seconds: each period is a pass (the fast axis of a "
+        "raster, while the slow one moves on). 0: a trajectory is one pass.",
+        TIMEOUT,
+    ),
     each_axis(
         "learn_limit", nan,
         "Most that learning adds to a desired displacement, metres; NaN: a quarter of the stroke.", (1e-12, 1.0),

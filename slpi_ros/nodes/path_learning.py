@@ -25,7 +25,7 @@ from slpi_ros.nodes.jobs import normal_scheduling
 OFF, ON = "off", "on"
 # How much less urgent the process is than the node.
 NICENESS = 10
-# Passes that wait for the process; a later one is not learned from.
+# Requests that wait for the process; passes that come with more are not learned from.
 MOST_WAITING = 4
 
 
@@ -45,7 +45,7 @@ class Forgetting:
     prefix: str
 
 
-Request = Opening | FinishedPass | Forgetting
+Request = Opening | tuple[FinishedPass, ...] | Forgetting
 
 
 def serve(connection: Connection) -> None:
@@ -63,8 +63,8 @@ def serve(connection: Connection) -> None:
             before = paths
             paths = RepeatedPaths(parse_model(request.document, "the model"), request.prefix, request.limit)
             answer = [*paths.take_over(before), *paths.load()]
-        elif isinstance(request, FinishedPass):
-            answer = [paths.learn(request)]
+        elif isinstance(request, tuple):
+            answer = paths.learn(*request)
         else:
             paths.prefix = request.prefix
             answer = paths.forget()
@@ -80,7 +80,7 @@ class PathLearning:
 
     def __init__(self, controller: Controller, prefix: str, on_forgotten: Callable[[int], None]) -> None:
         self.passes = PathPasses()
-        self.mode = OFF
+        self.mode, self.period = OFF, 0.0
         self.limit: Mapping[str, float] | None = None
         self.progress: dict[str, AxisProgress] = {}  # of the path that came last, by axis
         self.remarks: deque[str] = deque()  # to be logged
@@ -94,10 +94,13 @@ class PathLearning:
         self._era = 0  # answers to requests of an earlier one are void
         self.waiting = 0  # requests that the process has not answered yet
 
-    def use(self, mode: str, limit: Mapping[str, float] | None) -> None:
-        """Learn (`on`), follow what was learned (`hold`) or neither (`off`); at most `limit` (m, by axis) is added."""
+    def use(self, mode: str, limit: Mapping[str, float] | None, period: float) -> None:
+        """Learn (`on`), follow what was learned (`hold`) or neither (`off`).
+
+        At most `limit` (m, by axis) is added; `period` (s): of paths that repeat within a trajectory, 0: none.
+        """
         changed = limit != self.limit
-        self.mode, self.limit = mode, limit
+        self.mode, self.limit, self.period = mode, limit, period
         if mode == OFF:
             self.passes.forget()
             self.progress = {}
@@ -137,7 +140,7 @@ class PathLearning:
             valid = Trajectory.of(names, times, positions, axes=self._controller.names)
         except RejectedError:
             return None, plain
-        path = SampledPath.of(valid.names, valid.time_from_start_ns, valid.positions, period)
+        path = SampledPath.of(valid.names, valid.time_from_start_ns, valid.positions, period, self.period)
         correction = self.passes.corrections.get(path.identity) if path else None
         return path, (path.corrected(correction, period) if path and correction else plain)
 
@@ -166,9 +169,9 @@ class PathLearning:
         if clock_ns and self.passes.on:
             if self._controller.mode is not OperatingMode.TRAJECTORY:
                 self.passes.end(clock_ns)
-            for done in self.passes.take(clock_ns):
-                if self.waiting < MOST_WAITING:
-                    self._ask(partial(_given, done))
+            done = tuple(self.passes.take(clock_ns))
+            if done and self.waiting < MOST_WAITING:
+                self._ask(partial(_given, done))
 
     def forget(self) -> None:
         """Begin anew from the desired paths; `on_forgotten` is called when the files are removed."""

@@ -168,6 +168,37 @@ def test_what_a_limit_held_back_is_not_learned_from(limited, reason):
     assert missing == (list(range(5)) if limited == {"slewing": range(5)} else [])
 
 
+def test_a_path_that_repeats_is_learned_period_by_period_while_another_axis_moves_on():
+    count, n = 5, N - 1
+    times = np.arange(count * n + 1) * MS
+    fast, slow = np.resize(Y[:-1], times.size), np.linspace(0.0, 3e-6, times.size)
+    raster = np.column_stack([fast, slow])
+    path = SampledPath.of(["x", "y"], times, raster, PERIOD, n * PERIOD)
+    assert path.count == count and path.desired.keys() == {"x"} and path.desired["x"].size == n
+    # As many lines more, and another slow axis: the same fast one.
+    longer = SampledPath.of(["x", "y"], np.arange(2 * n + 1) * MS, raster[: 2 * n + 1] * [1.0, 2.0], PERIOD, n * PERIOD)
+    assert longer.identity == path.identity
+    # What does not repeat is one pass.
+    assert SampledPath.of(["y"], times, slow[:, None], PERIOD, n * PERIOD).count == 1
+    correction = np.linspace(0.0, 10e-9, n)
+    _, out_ns, positions = path.corrected({"x": correction}, PERIOD)
+    assert out_ns.tolist() == times.tolist()
+    assert positions == pytest.approx(raster + np.column_stack([np.resize(correction, times.size), 0.0 * slow]))
+    passes, one = PathPasses(), axis()
+    passes.corrections[path.identity] = {"x": correction}
+    passes.begin(path, START, START, PERIOD, True)
+    for k in range(times.size):
+        one.held = 250 <= k < 256
+        passes.output([one, axis("y")], START + k * MS)
+        passes.read(["x", "y"], [fast[k] + 1e-9 * (k // n), slow[k]], START + k * MS)
+    done = passes.take(START + 10_000 * MS)
+    # The first one comes from elsewhere.
+    assert [float(np.median(each.measured["x"] - Y[:-1])) for each in done] == pytest.approx([1e-9, 2e-9, 3e-9, 4e-9])
+    assert [sorted(each.unusable) for each in done] == [[], ["x"], [], []]
+    for each in done:
+        assert each.followed["x"] == pytest.approx(Y[:-1] + correction, abs=1e-15)
+
+
 def test_forgetting_begins_anew():
     passes, path = PathPasses(), sampled()
     follow(passes, path)

@@ -33,7 +33,7 @@ def run(paths, way, stage, count, correction=0.0):
     errors, learned = [], None
     for _ in range(count):
         done, error = passed(way, correction, stage)
-        learned = paths.learn(done)
+        (learned,) = paths.learn(done)
         correction = learned.correction["x"]
         errors.append(error)
     return learned, errors
@@ -88,9 +88,21 @@ def test_a_pass_that_a_limit_held_back_leads_back_to_the_best_path(model):
     stage, paths = Stage(way.desired["x"][0]), RepeatedPaths(model)
     before, _ = run(paths, way, stage, 6)
     done, _ = passed(way, before.correction["x"], stage, {"x": "the voltage is held at a limit at 9 of its samples"})
-    after = paths.learn(done)
+    (after,) = paths.learn(done)
     assert after.axes["x"].reason == "the voltage is held at a limit at 9 of its samples"
     assert after.axes["x"].best == before.axes["x"].best
+
+
+def test_several_passes_of_one_correction_make_one_step(model):
+    way = replace(sampled(), count=4)
+    stage, paths, correction, errors = Stage(way.desired["x"][0]), RepeatedPaths(model), 0.0, []
+    for _ in range(6):
+        passes = [passed(way, correction, stage) for _ in range(4)]
+        errors += [error for _, error in passes]
+        (learned,) = paths.learn(*(done for done, _ in passes))
+        correction = learned.correction["x"]
+    assert learned.axes["x"].passes == 24
+    assert errors[-1] < NOISE < 0.1 * errors[1]
 
 
 def test_limits_are_kept_and_forgetting_removes_the_files(model, tmp_path):
@@ -109,7 +121,7 @@ def test_limits_are_kept_and_forgetting_removes_the_files(model, tmp_path):
 def test_a_path_that_the_model_has_no_axis_of_is_not_learned(model):
     way = SampledPath.of(["z"], np.arange(50) * 1_000_000, np.ones((50, 1)) * 1e-6, 1e-3)
     done = FinishedPass(way, way.desired, way.desired, {})
-    learned = RepeatedPaths(model).learn(done)
+    (learned,) = RepeatedPaths(model).learn(done)
     assert not learned.correction and learned.remarks[0].startswith("not learned: ")
 
 

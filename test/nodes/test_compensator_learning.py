@@ -30,11 +30,11 @@ SAMPLES, RATE = 81, 50.0
 
 @pytest.fixture(scope="module")
 def model_file(tmp_path_factory) -> str:
-    """A model of the simulated stage that is wrong: by a tenth, more than the jitter of a busy machine, and simple."""
+    """A model of the simulated stage that is wrong: by a quarter, far more than the jitter of a busy machine, and simple."""
     t, v = calibration_drive(0.0, 100.0, duration=4.0, rate=500.0, seed=1)[:2]
     stage = Stage.random(["x"], 3, NOISE)
     y = [stage.measure(stage.step(at, [volt]))[0] for at, volt in zip(t, v, strict=True)]
-    record = Record(np.round(1e9 * np.asarray(t)).astype(np.int64), {"x": v}, {"x": 0.9 * np.array(y)})
+    record = Record(np.round(1e9 * np.asarray(t)).astype(np.int64), {"x": v}, {"x": 0.75 * np.array(y)})
     path = tmp_path_factory.mktemp("model") / "x.json"
     slpi_ros.save_model(slpi_ros.identify(record, "pi"), path)
     return str(path)
@@ -85,9 +85,8 @@ def test_the_error_falls_over_the_passes_is_kept_over_a_kill_and_forgotten(model
     with started("stage_simulator", {"seed": 3, "noise_rms": NOISE}):
         with learning(model_file, memory) as client:
             passes = Passes(client, raster(model_file))
-            told = passes.send(14)
+            told = passes.send(12)
             last = told[-1]
-            print([(one.get("x.learn_pass"), one.get("x.learn_error_nm"), one.get("x.learn_reason")) for one in told])
             assert int(last["x.learn_pass"]) > 6
             first, best = float(last["x.learn_first_nm"]), float(last["x.learn_best_nm"])
             assert first > 30e9 * NOISE

@@ -1,7 +1,7 @@
 """Passes of paths that come again: recognised by their content, recorded while they are followed; without ROS."""
 
 from array import array
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import numpy as np
 
@@ -111,12 +111,10 @@ class PassRecorder:
 
 
 class PathPasses:
-    """Recognise paths that come again, and record their passes; times in ns on the clock of trajectories."""
+    """Record the passes of paths; times in ns on the clock of trajectories."""
 
     def __init__(self) -> None:
         self.corrections: dict[str, Mapping[str, FloatArray]] = {}  # m, by identity of the path and axis
-        self.dropped = ""  # why the last pass that was dropped was
-        self._seen: dict[str, FinishedPass | None] = {}  # the first pass of a path that has come once
         self._recorders: list[PassRecorder] = []
 
     @property
@@ -151,39 +149,41 @@ class PathPasses:
             if recorder.begin_ns <= at_ns <= recorder.end_ns + SECOND_NS // 1000:
                 recorder.output(axes, at_ns)
 
-    def take(self, now_ns: int) -> list[FinishedPass]:
-        """Return the passes of paths that come again which have ended, in order."""
-        ready: list[FinishedPass] = []
+    def take(self, now_ns: int) -> list[PassRecorder]:
+        """Return what was recorded of the passes that have ended and are to be learned, in order."""
         ended = [one for one in self._recorders if one.end_ns + LAST_READING_NS < now_ns]
-        for recorder in ended:
-            self._recorders.remove(recorder)
-            if not recorder.learns:
-                continue
-            for done in recorder.finished():
-                if done.dropped:
-                    self.dropped = done.dropped
-                else:
-                    ready += self._again(done)
-        return ready
-
-    def _again(self, done: FinishedPass) -> list[FinishedPass]:
-        """Return the pass, and the first one of its path before the second; nothing while it has come once."""
-        identity = done.path.identity
-        if identity in self.corrections:
-            return [done]
-        if identity in self._seen:
-            first, self._seen[identity] = self._seen[identity], None
-            return [done] if first is None else [first, done]
-        # Of paths that came once, the readings of the last one only are kept.
-        self._seen = dict.fromkeys([*self._seen][-KNOWN_PATHS:]) | {identity: done}
-        return []
+        self._recorders = [one for one in self._recorders if one not in ended]
+        return [one for one in ended if one.learns]
 
     def forget(self) -> None:
         """Begin anew, from the desired paths."""
         self.corrections.clear()
-        self._seen.clear()
         self._recorders.clear()
-        self.dropped = ""
+
+
+class ComingAgain:
+    """Tell the passes of paths that come again; a path that comes once is only remembered."""
+
+    def __init__(self) -> None:
+        self.dropped = ""  # why the last pass that tells nothing does not
+        self._seen: dict[str, FinishedPass | None] = {}  # the first pass of a path that has come once
+
+    def of(self, recorders: Iterable[PassRecorder], known: Collection[str]) -> list[FinishedPass]:
+        """Return the passes to learn from; `known`: identities of paths that have been learned already."""
+        ready: list[FinishedPass] = []
+        for done in (done for recorder in recorders for done in recorder.finished()):
+            identity = done.path.identity
+            if done.dropped:
+                self.dropped = done.dropped
+            elif identity in known:
+                ready.append(done)
+            elif identity in self._seen:
+                first, self._seen[identity] = self._seen[identity], None
+                ready += [done] if first is None else [first, done]
+            else:
+                # Of paths that came once, the readings of the last one only are kept.
+                self._seen = dict.fromkeys([*self._seen][-KNOWN_PATHS:]) | {identity: done}
+        return ready
 
 
 def _at(t: FloatArray, at: FloatArray, readings: FloatArray, interval: float) -> FloatArray:

@@ -2,7 +2,7 @@
 
 import glob
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -18,7 +18,7 @@ from slpi_ros.learning.learner import FEWEST, Learner, path_identity, read_learn
 from slpi_ros.model.stage_model import StageModel
 
 # Most samples of a pass that are learned; a longer one is learned at longer intervals.
-MOST_SAMPLES = 20_000
+MOST_SAMPLES = 10_000
 # Paths that are learned at the same time, and files that are kept; those that came last.
 MOST_PATHS = 16
 # A path that repeats has at least so many periods, which differ by at most this share of what they cover.
@@ -176,6 +176,11 @@ class RepeatedPaths:
     def __init__(self, model: StageModel, prefix: str = "", limit: Mapping[str, float] | None = None) -> None:
         self.model, self.prefix, self.limit = model, prefix, limit
         self._learners: dict[str, Learner] = {}
+
+    @property
+    def known(self) -> Collection[str]:
+        """Identities of the paths that are learned."""
+        return self._learners.keys()
 
     def load(self) -> list[Learned]:
         """Go on from the kept files of this stage; those of others are left alone, which is said in a remark."""

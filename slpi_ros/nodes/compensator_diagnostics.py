@@ -280,7 +280,7 @@ def _axis_problems(axis: Axis, factor: float, moving: bool) -> Iterator[Problem]
 
 
 def _learning_values(learning: PathLearning) -> dict[str, object]:
-    values: dict[str, object] = {"learn": learning.mode, "learn_dropped": learning.passes.dropped}
+    values: dict[str, object] = {"learn": learning.mode, "learn_dropped": learning.dropped}
     for name, one in learning.progress.items():
         values |= {
             f"{name}.learn_pass": one.passes,

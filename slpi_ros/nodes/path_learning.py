@@ -14,10 +14,10 @@ from typing import Any
 from numpy.typing import ArrayLike
 
 from slpi_ros.compensator.controller import Controller, OperatingMode
-from slpi_ros.compensator.path_passes import PathPasses
+from slpi_ros.compensator.path_passes import ComingAgain, PassRecorder, PathPasses
 from slpi_ros.compensator.trajectory import Trajectory
 from slpi_ros.compensator.validation import RejectedError
-from slpi_ros.learning.repeated_paths import AxisProgress, FinishedPass, Learned, RepeatedPaths, SampledPath
+from slpi_ros.learning.repeated_paths import AxisProgress, Learned, RepeatedPaths, SampledPath
 from slpi_ros.model.document import format_model, parse_model
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.jobs import normal_scheduling
@@ -45,29 +45,38 @@ class Forgetting:
     prefix: str
 
 
-Request = Opening | tuple[FinishedPass, ...] | Forgetting
+@dataclass(frozen=True)
+class Answer:
+    """What is known of paths; why the last pass that tells nothing does not; how many paths were forgotten, if so."""
+
+    learned: Sequence[Learned] = ()
+    dropped: str = ""
+    forgotten: int | None = None
+
+
+Request = Opening | tuple[PassRecorder, ...] | Forgetting
 
 
 def serve(connection: Connection) -> None:
-    """Answer requests until the other end is closed: a list of what is known, or how many paths were forgotten."""
+    """Answer requests until the other end is closed."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     os.nice(NICENESS)
-    paths = RepeatedPaths(StageModel({}))
+    paths, again = RepeatedPaths(StageModel({})), ComingAgain()
     while True:
         try:
             request: Request = connection.recv()
         except (EOFError, OSError):
             return
-        answer: list[Learned] | int
         if isinstance(request, Opening):
             before = paths
             paths = RepeatedPaths(parse_model(request.document, "the model"), request.prefix, request.limit)
-            answer = [*paths.take_over(before), *paths.load()]
+            answer = Answer([*paths.take_over(before), *paths.load()])
         elif isinstance(request, tuple):
-            answer = paths.learn(*request)
+            learned = paths.learn(*again.of(request, paths.known))
+            answer = Answer(learned, again.dropped)
         else:
-            paths.prefix = request.prefix
-            answer = paths.forget()
+            paths.prefix, again = request.prefix, ComingAgain()
+            answer = Answer(forgotten=paths.forget())
         connection.send(answer)
 
 
@@ -83,6 +92,7 @@ class PathLearning:
         self.mode, self.period = OFF, 0.0
         self.limit: Mapping[str, float] | None = None
         self.progress: dict[str, AxisProgress] = {}  # of the path that came last, by axis
+        self.dropped = ""  # why the last pass that tells nothing does not
         self.remarks: deque[str] = deque()  # to be logged
         self._controller, self._prefix, self._on_forgotten = controller, prefix, on_forgotten
         self._model: StageModel | None = None
@@ -90,7 +100,7 @@ class PathLearning:
         self._thread = ThreadPoolExecutor(1, "learning")
         self._process: Any = None
         self._connection: Connection | None = None
-        self._answers: deque[tuple[int, list[Learned] | int]] = deque()
+        self._answers: deque[tuple[int, Answer]] = deque()
         self._era = 0  # answers to requests of an earlier one are void
         self.waiting = 0  # requests that the process has not answered yet
 
@@ -156,10 +166,14 @@ class PathLearning:
         while self._answers:
             era, answer = self._answers.popleft()
             self.waiting -= 1
-            if isinstance(answer, int):
-                self._on_forgotten(answer)
+            self.dropped = answer.dropped or self.dropped
+            if answer.forgotten is not None:
+                self.dropped = ""
+                self._on_forgotten(answer.forgotten)
+                if self.mode == OFF:
+                    self._thread.submit(self._stop)
                 continue
-            for one in answer:
+            for one in answer.learned:
                 self.remarks.extend(one.remarks)
                 if era == self._era and one.identity:
                     self.passes.corrections[one.identity] = one.correction
@@ -201,7 +215,7 @@ class PathLearning:
         except (EOFError, OSError) as error:
             self._process, self._opened = None, False
             why = f"learning: its process has ended ({type(error).__name__}); what follows is learned from the files"
-            answer = [Learned("", {}, {}, (why,))]
+            answer = Answer([Learned("", {}, {}, (why,))])
         self._answers.append((era, answer))
 
     def _stop(self) -> None:

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from slpi_ros.compensator.path_passes import LATE, PathPasses
+from slpi_ros.compensator.path_passes import LATE, ComingAgain, PathPasses
 from slpi_ros.compensator.statistics import TrackingStatistics
 from slpi_ros.learning.repeated_paths import MOST_SAMPLES, SampledPath
 
@@ -24,6 +24,21 @@ def axis(name="x"):
     return SimpleNamespace(name=name, voltage=20.0, held=False, slewing=False, tracking=TrackingStatistics())
 
 
+class Passes(PathPasses):
+    """Passes, and which of them are to be learned from."""
+
+    def __init__(self):
+        super().__init__()
+        self.again = ComingAgain()
+
+    def ready(self, now_ns):
+        return self.again.of(self.take(now_ns), self.corrections)
+
+    @property
+    def dropped(self):
+        return self.again.dropped
+
+
 def follow(passes, path, begin=START, learns=True, late=(), limited=None, one=None, read=lambda k: Y[k] + 3e-9):
     """Follow a pass from `begin` (ns) on; `late`: samples that are not output, `limited`: those by attribute."""
     one = one or axis()
@@ -36,7 +51,7 @@ def follow(passes, path, begin=START, learns=True, late=(), limited=None, one=No
             passes.output([one], now)
         if (value := read(k)) is not None:
             passes.read(["other", "x"], [1.0, value], now)
-    return passes.take(begin + 2 * N * MS)
+    return passes.ready(begin + 2 * N * MS)
 
 
 def test_a_path_is_known_by_its_content_whatever_its_points():
@@ -64,7 +79,7 @@ def test_what_is_too_short_is_no_path_and_a_long_one_is_learned_at_longer_interv
 
 
 def test_the_first_pass_is_remembered_and_learned_with_the_second():
-    passes, path = PathPasses(), sampled()
+    passes, path = Passes(), sampled()
     assert follow(passes, path) == []
     first, second = follow(passes, sampled(), START + 1_000 * MS)
     for one in (first, second):
@@ -76,7 +91,7 @@ def test_the_first_pass_is_remembered_and_learned_with_the_second():
 
 
 def test_a_correction_is_followed_and_is_not_what_was_desired():
-    passes, path, one = PathPasses(), sampled(), axis()
+    passes, path, one = Passes(), sampled(), axis()
     passes.corrections[path.identity] = {"x": np.linspace(0.0, 100e-9, N)}
     (done,) = follow(passes, path, one=one)
     assert done.followed["x"] == pytest.approx(Y + np.linspace(0.0, 100e-9, N), abs=1e-15)
@@ -87,7 +102,7 @@ def test_a_correction_is_followed_and_is_not_what_was_desired():
 
 
 def test_passes_follow_each_other_without_a_pause():
-    passes, path = PathPasses(), sampled()
+    passes, path = Passes(), sampled()
     passes.corrections[path.identity] = {}
     length = (N - 1) * MS
     passes.begin(path, START, START - MS, PERIOD, True)
@@ -98,7 +113,7 @@ def test_passes_follow_each_other_without_a_pause():
             passes.begin(path, START + length, START + k * MS, PERIOD, True)
         passes.output([one], START + k * MS)
         passes.read(["x"], [Y[k % (N - 1)]], START + k * MS)
-    done = passes.take(START + 2 * length + 1_000 * MS)
+    done = passes.ready(START + 2 * length + 1_000 * MS)
     assert [each.dropped for each in done] == ["", ""]
     for each in done:
         assert each.measured["x"] == pytest.approx(Y, abs=1e-15)
@@ -106,7 +121,7 @@ def test_passes_follow_each_other_without_a_pause():
 
 @pytest.mark.parametrize("how", ["cancelled", "replaced", "replaced later"])
 def test_a_pass_that_does_not_end_tells_nothing(how):
-    passes, path, other = PathPasses(), sampled(), sampled(2 * Y)
+    passes, path, other = Passes(), sampled(), sampled(2 * Y)
     passes.corrections[path.identity] = {}
     passes.begin(path, START, START, PERIOD, True)
     for k in range(50):
@@ -118,18 +133,18 @@ def test_a_pass_that_does_not_end_tells_nothing(how):
         assert not passes.on
     else:
         passes.begin(other, now + 30 * MS if how == "replaced later" else 0, now, PERIOD, True)
-    assert passes.take(START + 10_000 * MS) == []
+    assert passes.ready(START + 10_000 * MS) == []
 
 
 def test_a_pass_that_is_not_to_be_learned_still_tells_its_setpoints():
-    passes, path, one = PathPasses(), sampled(), axis()
+    passes, path, one = Passes(), sampled(), axis()
     passes.corrections[path.identity] = {"x": np.full(N, 8e-9)}
     assert follow(passes, path, learns=False, one=one) == []
     assert one.tracking.learned == 8e-9
 
 
 def test_gaps_are_no_readings_and_too_many_of_them_tell_nothing():
-    passes, path = PathPasses(), sampled()
+    passes, path = Passes(), sampled()
     passes.corrections[path.identity] = {}
     (done,) = follow(passes, path, read=lambda k: None if 40 <= k < 48 else Y[k])
     assert np.flatnonzero(np.isnan(done.measured["x"])).tolist() == list(range(40, 48))
@@ -140,7 +155,7 @@ def test_gaps_are_no_readings_and_too_many_of_them_tell_nothing():
 
 
 def test_what_was_output_late_is_no_reading():
-    passes, path = PathPasses(), sampled()
+    passes, path = Passes(), sampled()
     passes.corrections[path.identity] = {}
     assert follow(passes, path, late=range(30, 60)) == []
     assert passes.dropped == "the computer was busy: the path was output up to 31 ms late"
@@ -160,7 +175,7 @@ def test_what_was_output_late_is_no_reading():
     ],
 )
 def test_what_a_limit_held_back_is_not_learned_from(limited, reason):
-    passes, path = PathPasses(), sampled()
+    passes, path = Passes(), sampled()
     passes.corrections[path.identity] = {}
     (done,) = follow(passes, path, limited=limited)
     assert done.unusable == ({"x": reason} if reason else {})
@@ -184,14 +199,14 @@ def test_a_path_that_repeats_is_learned_period_by_period_while_another_axis_move
     _, out_ns, positions = path.corrected({"x": correction}, PERIOD)
     assert out_ns.tolist() == times.tolist()
     assert positions == pytest.approx(raster + np.column_stack([np.resize(correction, times.size), 0.0 * slow]))
-    passes, one = PathPasses(), axis()
+    passes, one = Passes(), axis()
     passes.corrections[path.identity] = {"x": correction}
     passes.begin(path, START, START, PERIOD, True)
     for k in range(times.size):
         one.held = 250 <= k < 256
         passes.output([one, axis("y")], START + k * MS)
         passes.read(["x", "y"], [fast[k] + 1e-9 * (k // n), slow[k]], START + k * MS)
-    done = passes.take(START + 10_000 * MS)
+    done = passes.ready(START + 10_000 * MS)
     # The first one comes from elsewhere.
     assert [float(np.median(each.measured["x"] - Y[:-1])) for each in done] == pytest.approx([1e-9, 2e-9, 3e-9, 4e-9])
     assert [sorted(each.unusable) for each in done] == [[], ["x"], [], []]
@@ -200,8 +215,8 @@ def test_a_path_that_repeats_is_learned_period_by_period_while_another_axis_move
 
 
 def test_forgetting_begins_anew():
-    passes, path = PathPasses(), sampled()
-    follow(passes, path)
+    passes, path = Passes(), sampled()
+    passes.begin(path, START, START, PERIOD, True)
     passes.corrections[path.identity] = {"x": np.ones(N)}
     passes.forget()
     assert not passes.on and not passes.corrections

@@ -27,6 +27,8 @@ NOISE = 4e-9
 # One pass: a triangle with rounded turns; a rate that a busy machine keeps up with.
 SAMPLES, RATE = 81, 50.0
 MOST_PASSES = 30
+# The path has at least this error, rms, and at most the other one when it has been learned on a busy machine.
+UNCORRECTED_NM, LEARNED_NM = 220.0, 140.0
 
 
 @pytest.fixture(scope="module")
@@ -90,9 +92,8 @@ def test_the_error_falls_over_the_passes_is_kept_over_a_kill_and_forgotten(model
     with started("stage_simulator", {"seed": 3, "noise_rms": NOISE}):
         with learning(model_file, memory) as client:
             passes = Passes(client, raster(model_file))
-            last = passes.until(lambda told: figure(told, "error_nm") < 0.4 * figure(told, "first_nm"))
-            first = figure(last, "first_nm")
-            assert first > 30e9 * NOISE
+            last = passes.until(lambda told: figure(told, "error_nm") < LEARNED_NM)
+            assert figure(last, "first_nm") > UNCORRECTED_NM
             assert figure(last, "best_nm") <= figure(last, "error_nm")
             client.node.stop(signal.SIGKILL)
             client.graph.tested = None
@@ -101,10 +102,10 @@ def test_the_error_falls_over_the_passes_is_kept_over_a_kill_and_forgotten(model
             client.report("what was kept", **{"x.learn_first_nm": last["x.learn_first_nm"]})
             passes = Passes(client, raster(model_file))
             after = passes.until(lambda told: figure(told, "pass") > figure(last, "pass"))
-            assert figure(after, "error_nm") < 0.7 * first
+            assert figure(after, "error_nm") < UNCORRECTED_NM
             answer = client.graph.call(Trigger, f"{client.name}/forget", Trigger.Request())
             assert answer.success and answer.message == "forgotten: 1 path"
             assert not list(tmp_path.glob("memory.json.learned.*.json"))
             again = passes.until(lambda told: True)
             assert figure(again, "pass") <= 3
-            assert figure(again, "first_nm") > 0.7 * first
+            assert figure(again, "first_nm") > UNCORRECTED_NM

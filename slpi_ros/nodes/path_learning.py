@@ -207,15 +207,20 @@ class PathLearning:
     def _answer(self, era: int, request: Callable[[], Request]) -> None:
         """Send a request to the process, which is started if there is none; wait for its answer."""
         try:
+            wanted = request()
             if self._process is None or not self._process.is_alive():
+                if isinstance(wanted, tuple):
+                    # A new process has to be given the model first.
+                    raise EOFError
                 self._start()
             assert self._connection
-            self._connection.send(request())
+            self._connection.send(wanted)
             answer = self._connection.recv()
-        except (EOFError, OSError) as error:
+        except (EOFError, OSError):
             self._process, self._opened = None, False
-            why = f"learning: its process has ended ({type(error).__name__}); what follows is learned from the files"
-            answer = Answer([Learned("", {}, {}, (why,))])
+            answer = Answer(
+                [Learned("", {}, {}, ("the process that learns has ended: learning goes on from the files",))]
+            )
         self._answers.append((era, answer))
 
     def _stop(self) -> None:

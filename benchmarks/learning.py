@@ -14,8 +14,9 @@ follows one path again and again:
 Printed is the **true** error, rms in nm, without the mean of the pass: of the first pass, and after 5 and `--passes`
 passes; the best gains are those with the least error after the last pass. Marks: ``NOISE`` where the last pass is
 above the sensor's noise, ``TENTH`` where it is above a tenth of the first although there was room, ``LINE`` where after
-5 passes it is above a third of ``line``, and ``HARM`` where a pass is more than a tenth worse than the first two, which
-both follow the uncorrected path (the first one comes from rest).
+5 passes it is above a third of ``line``, and ``HARM`` where a pass is more than a tenth worse than the first
+one and than the sensor's noise; ``(alone too)`` where the inverse alone is as bad in one of the same passes (the
+first one comes from rest: a mode that rings, and creep, come later).
 """
 
 import argparse
@@ -242,6 +243,10 @@ def compare(
             print(f"      pass {report.number}: {report.reason}")
     errors["limited"] = [report.limited_by]  # type: ignore[list-item]
     errors["bandwidth"] = [report.bandwidth]
+    run, errors["alone"] = Run(specimen, axis, desired), []
+    for _ in range(passes):
+        errors["alone"].append(rms(run.follow(desired)[1], desired, judged))
+        run.back()
     if not beside:
         return errors
     tried: list[list[float]] = []
@@ -281,7 +286,7 @@ def main() -> int:
     warnings.simplefilter("ignore")
     print(f"true error, rms nm, without mean; after 5 and {options.passes} passes")
     print(f"{'stage':<34}{'path':<12}{'noise':>6}{'first':>8}{'PI':>8}{'line 5':>8}{'last':>8}{'own 5':>10}{'last':>8}")
-    counts = {"NOISE": 0, "TENTH": 0, "LINE": 0, "HARM": 0}
+    counts = {"NOISE": 0, "TENTH": 0, "LINE": 0, "HARM": 0, "HARM (alone too)": 0}
     rows = 0
     for seed in range(options.seed, options.seed + options.count):
         specimen = Specimen.draw(seed)
@@ -301,10 +306,13 @@ def main() -> int:
                 marks.append("TENTH")
             if line and own[min(5, len(own) - 1)] > max(line[min(5, len(line) - 1)] / 3.0, noise):
                 marks.append("LINE")
-            if max(own[2:]) > 1.1 * max(own[:2]):
+            if max(own) > 1.1 * max(own[0], noise):
                 marks.append("HARM")
             for mark in marks:
                 counts[mark] += 1
+            if "HARM" in marks and max(own) <= 1.1 * max(errors["alone"]):
+                counts["HARM (alone too)"] += 1
+                marks.append("(alone too)")
             rows += 1
             fifth = f"{line[min(5, len(line) - 1)]:>8.1f}{line[-1]:>8.1f}" if line else f"{'':>16}"
             print(f"{'':<34}{name:<12}{noise:>6.1f}{own[0]:>8.1f}{errors.get('PI', [math.nan])[-1]:>8.1f}{fifth}"

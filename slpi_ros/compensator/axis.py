@@ -269,7 +269,7 @@ class Axis:
                 dt = self.output.period if self._arrivals else 0.0
         self._ticked = 0.0
         self._arrivals = (*self._arrivals[-3:], now_ns)
-        self.tracking.desired = y
+        self.tracking.desired, self.tracking.learned = y, 0.0
         self.path.sample(dt, y)
         v = self._sample(dt, y, now_ns)
         self._follow_later(now_ns)

@@ -99,10 +99,11 @@ class TrackingReport:
 class TrackingStatistics:
     """Collect the tracking error (m), measured - desired, of one axis."""
 
-    __slots__ = ("_count", "_errors", "desired", "fresh")
+    __slots__ = ("_count", "_errors", "desired", "fresh", "learned")
 
     def __init__(self) -> None:
         self.desired: float | None = None  # m; None while the axis follows none
+        self.learned = 0.0  # m, the part of the setpoint that was learned, which nobody desired
         self.fresh = False  # measured since the last report
         self._errors = array("d", bytes(8 * TRACKED))
         self._count = 0
@@ -110,7 +111,8 @@ class TrackingStatistics:
     def measure(self, displacement: float, desired: float | None = None) -> None:
         """Store the error of a displacement (m) from the setpoint it refers to (m), by default the present one."""
         if self.desired is not None:
-            self._errors[self._count % TRACKED] = displacement - (self.desired if desired is None else desired)
+            setpoint = self.desired if desired is None else desired
+            self._errors[self._count % TRACKED] = displacement - (setpoint - self.learned)
             self._count += 1
             self.fresh = True
 

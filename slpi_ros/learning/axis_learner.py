@@ -10,8 +10,8 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import ModelError, length
-from slpi_ros.learning.first_guess import first_guess
-from slpi_ros.learning.harmonics import ComplexArray, Harmonics
+from slpi_ros.learning.first_guess import first_guess, ringing
+from slpi_ros.learning.harmonics import TEST_ABOVE, ComplexArray, Harmonics
 from slpi_ros.learning.passes import Judged, agreed, judge
 from slpi_ros.model.axis_model import AxisModel
 
@@ -22,6 +22,8 @@ WORSE, WORSE_BY_NOISE = 1.1, 4.0
 # Times that learning goes back to the best pass without a better one since, and passes in a row that cannot be learned
 # from, until it is held.
 MOST_RETURNS, MOST_REFUSED = 2, 3
+# How a text begins that says why learning is held.
+HELD = "held"
 # Passes after which the best one is forgotten, as the stage is another one by then.
 BEST_PASSES = 50
 # Largest part of the stroke that learning may add to the desired path, by default.
@@ -40,6 +42,13 @@ ANSWER = 5.0
 # A change has settled where a pass differs from the one before by this share of what it has changed; most passes that
 # are waited for. Before that, a pass that is so much worse than the best leads back at once.
 SETTLED, MOST_DWELL, AT_ONCE = 0.2, 6, 1.5
+# A change of a path that closes comes in without a jump, which an identified mode would answer to: over this many of
+# its periods, and at most this share of the pass.
+ONSET_PERIODS, ONSET = 5.0, 0.25
+# A mode has its part in the harmonics within this share of its frequency.
+BAND = 0.2
+# A path that is followed is the one asked for within this (m).
+SAME_PATH = 1e-13
 # A harmonic's error counts beyond this many standard deviations.
 CLEAR = 2.0
 
@@ -97,7 +106,9 @@ class AxisLearner:
         self.record = math.inf  # m^2, least mean square error of a pass so far
         self.best: _Best | None = None
         self._deviating: Mask | None = None
-        self._last = np.zeros(desired.size)  # correction of the pass before
+        self._last = np.zeros(desired.size)  # correction of the pass before that was learned from
+        self._before = np.zeros(desired.size)  # correction at the end of the pass before
+        self._aimed = self._before  # what the correction became in the last pass that was learned from
         self._offset: float | None = None
         self._hashes: list[str] = []
         self._clipped = self._told = ""
@@ -107,18 +118,48 @@ class AxisLearner:
         self._changed: FloatArray | None = None
         self._since = 0
         self._dwell: int | None = None
+        # Harmonics near an identified mode that rings from pass to pass, passes until it has settled, and passes since
+        # these harmonics were changed.
+        self._ringing = np.zeros(self.frequency.size, dtype=np.bool_)
+        self._ring_dwell, self._ring_since = 1, MOST_DWELL
+        slowest = 0.0
+        for hertz, seconds in ringing(axis):
+            slowest = max(slowest, ONSET_PERIODS / hertz)
+            passes = _passes_until_settled(self._size * dt, seconds)
+            if passes > 1:
+                self._ringing |= np.abs(self.frequency - hertz) < BAND * hertz
+                self._ring_dwell = max(self._ring_dwell, passes)
+        rising = max(1.0, min(ONSET * desired.size, slowest / dt))
+        self._onset = 0.5 - 0.5 * np.cos(np.pi * np.minimum((np.arange(desired.size) + (rising == 1.0)) / rising, 1.0))
         self._lead_in: FloatArray | None = None
         self._returned = False  # the next pass is that of the best path again
         noise = np.full(self.frequency.size, self._size * max(axis.quality.floor_rms, 1e-12) ** 2)
         guess, variance = first_guess(axis, dt, self.frequency)
-        self.harmonics = Harmonics.first(guess, variance, noise)
+        self._guess = Harmonics.first(guess, variance, noise)
+        self.harmonics = self._guess
 
     @property
     def path(self) -> FloatArray:
-        """The desired path of the next pass, (N,), metres."""
+        """The desired path of the next pass, (N,), metres: a change of `aim` comes in without a jump."""
+        correction = self.correction
+        if self.closed:
+            correction = self._before + self._onset * (correction - self._before)
+        return self._within_range(correction)
+
+    @property
+    def aim(self) -> FloatArray:
+        """The desired path of the passes after the next one, (N,), metres."""
+        return self._within_range(self.correction)
+
+    def _within_range(self, correction: FloatArray) -> FloatArray:
         low, high = self.axis.displacement_range
         low, high = min(low, float(self.desired.min())), max(high, float(self.desired.max()))
-        return np.asarray(np.clip(self.desired + self.correction, low, high))
+        return np.asarray(np.clip(self.desired + correction, low, high))
+
+    @property
+    def _still(self) -> bool:
+        """Whether the modes have settled since their harmonics were changed."""
+        return self._ring_since >= self._ring_dwell
 
     @property
     def noise(self) -> float:
@@ -126,11 +167,21 @@ class AxisLearner:
         return math.sqrt(self._power(self.harmonics.noise))
 
     def update(
-        self, measured: FloatArray, voltage: FloatArray | None = None, followed: FloatArray | None = None
+        self,
+        measured: FloatArray,
+        voltage: FloatArray | None = None,
+        followed: FloatArray | None = None,
+        unusable: str = "",
     ) -> PassReport:
-        """Learn from a pass of which the path `followed` (m; default: `path`) was asked; shape (N,), m and V."""
-        if followed is not None:
-            self.correction = followed - self.desired
+        """Learn from a pass of which the path `followed` (m; default: `path`) was asked; shape (N,), m and V.
+
+        `unusable`: why it is not to be learned from, if that is known.
+        """
+        if followed is not None and not np.allclose(followed, self.path, rtol=0.0, atol=SAME_PATH):
+            self.correction = self._before = followed - self.desired
+        commanded = self.path - self.desired
+        self._before = self.correction
+        self._ring_since += 1
         seen = (
             self.axis.correct(np.arange(measured.size, dtype=np.float64) * self.dt, measured)
             if self.axis.corrects
@@ -139,10 +190,10 @@ class AxisLearner:
         low, high = self.axis.displacement_range
         seen = np.where(np.abs(seen - self.desired) <= FAR * (high - low), seen, np.nan)
         first = not self.harmonics.passes
-        correction = self._spectrum(self.correction)
+        correction = self._spectrum(commanded)
         expected = self.desired if first else self._signal(self.harmonics.expected(correction))
         floor = math.sqrt(self._power(np.full(self.frequency.size, self.harmonics.noise.min())))
-        change = self._spectrum(self.correction - self._last)
+        change = self._spectrum(commanded - self._last)
         own = ANSWER**2 * self._power(np.abs(change) ** 2)
         power = own + self._power(self.harmonics.variance(correction) + self.harmonics.noise) if not first else math.inf
         error = next((one.error for one in reversed(self.passes) if one.learned), math.inf)
@@ -152,7 +203,7 @@ class AxisLearner:
         judged = judge(seen, expected, math.sqrt(power), floor, self._deviating, error)
         if self._lead_in is not None and not judged.reason:
             judged = agreed(self._lead_in, judged, self.desired, floor)
-        reason = self._replayed(measured) or judged.reason or self._held_back(voltage)
+        reason = unusable or self._replayed(measured) or judged.reason or self._held_back(voltage)
         offset, drift = self._offset_and_drift(judged, expected, first=first)
         clean = judged.measured - offset - drift * (np.arange(measured.size) / measured.size - 0.5)
         rest = (clean - self.desired)[np.isfinite(clean)]
@@ -161,7 +212,7 @@ class AxisLearner:
         if reason:
             self._refuse(reason, new=bool(change.any()))
         else:
-            self._learn(correction, clean, judged, rms)
+            self._learn(commanded, clean, judged, rms)
             self._offset = offset
         report = PassReport(
             len(self.passes) + 1, rms, absolute, offset, drift, int(np.count_nonzero(judged.bumps)), not reason,
@@ -171,7 +222,7 @@ class AxisLearner:
         del self.passes[:-KEPT_PASSES]
         return report
 
-    def _learn(self, correction: ComplexArray, clean: FloatArray, judged: Judged, rms: float) -> None:
+    def _learn(self, commanded: FloatArray, clean: FloatArray, judged: Judged, rms: float) -> None:
         self._told, self.refused = "", 0
         if self._lead_in is None and not self.passes:
             # The first pass comes from rest, and nothing was there to compare it with: no step is made for it.
@@ -180,13 +231,13 @@ class AxisLearner:
             return
         lead_in, self._lead_in = self._lead_in, None
         settled = self._settled(clean)
-        self._deviating, self._last = judged.deviating, self.correction
+        self._deviating, self._last, self._aimed = judged.deviating, commanded, self.correction
         if not settled and not (self.best and rms**2 > AT_ONCE**2 * self.best.power + self._scatter()):
             self._told = "its changes are still settling"
             return
-        h, seen = self.harmonics, self._spectrum(clean)
+        h, seen, correction = self.harmonics, self._spectrum(clean), self._spectrum(commanded)
         if h.passes:
-            self.harmonics = h.after(correction, seen)
+            self.harmonics = h.after(correction, seen, self._due)
         else:
             self.harmonics = h.begun(
                 self.wanted + correction, seen, seen if lead_in is None else self._spectrum(lead_in)
@@ -199,36 +250,58 @@ class AxisLearner:
         if best is not None and again:
             # The best path once more: its error was lucky, or what has come between is still settling.
             self.best = replace(best, power=max(best.power, 0.5 * (best.power + rms**2)))
-        elif best is None or rms**2 < best.power:
+        elif self._still and (best is None or rms**2 < best.power):
             if rms**2 < self.record - self._scatter():
                 self.returns = 0
             self.record = min(self.record, rms**2)
             self.best = _Best(number, rms**2, self.correction)
-        elif rms**2 > WORSE**2 * best.power + self._scatter():
+        elif best and rms**2 > (WORSE if self._still else AT_ONCE) ** 2 * best.power + self._scatter():
             self._return(f"worse than pass {best.number}: {length(rms)} after {length(math.sqrt(best.power))}")
             return
-        if not self.held:
-            self._step(correction)
+        if self.held:
+            return
+        if not self._still and self._testing:
+            self._told = "its changes are still settling"
+        else:
+            self._step()
+
+    @property
+    def _due(self) -> Mask:
+        """Harmonics, (K,), that are learned from this pass: those of a mode only when it has settled."""
+        return ~self._ringing | self._still
+
+    @property
+    def _testing(self) -> bool:
+        """Whether the gain of a mode is not known yet: nothing else is changed while it answers to a test."""
+        h, unknown = self.harmonics, self._ringing & ~self.harmonics.phase_known
+        error = np.abs(self.left) > TEST_ABOVE * np.sqrt(h.variance(self._spectrum(self.correction)))
+        return bool((unknown & error).any())
 
     def _settled(self, clean: FloatArray) -> bool:
         """Return whether the answer to the last change of the path has settled: a lightly damped mode rings for passes.
 
         The first change of the path is followed until a pass is like the one before; later ones as many passes.
         """
-        if (self.correction != self._last).any():
+        if (self.correction != self._aimed).any():
             self._since, self._changed = 0, self._previous
         self._since, before = self._since + 1, self._previous
         self._previous = clean
         if self._changed is None or before is None:
             return True
         if self._since > 1 and self._dwell is None:
-            moved, answered = (float(np.var(clean - other)) for other in (before, self._changed))
+            moved, answered = (
+                self._power(np.abs(self._spectrum(clean - other)) ** 2 * ~self._ringing)
+                for other in (before, self._changed)
+            )
             if moved < max(SETTLED**2 * answered, 4.0 * self.noise**2) or self._since > MOST_DWELL:
                 self._dwell = self._since - 1
         return self._dwell is not None and self._since >= self._dwell
 
-    def _step(self, correction: ComplexArray) -> None:
-        step = self._signal(self.harmonics.step(correction, self.wanted, self.gain)) * self.taper
+    def _step(self) -> None:
+        harmonics = self.harmonics.step(self._spectrum(self.correction), self.wanted, self.gain) * self._due
+        if harmonics[self._ringing].any():
+            self._ring_since = 0
+        step = self._signal(harmonics) * self.taper
         wanted = self.correction + step
         allowed = np.clip(wanted, -self.limit, self.limit)
         low, high = self.axis.displacement_range
@@ -242,19 +315,22 @@ class AxisLearner:
         """Go back to the best pass with half the gain; the second time without a better one since, hold."""
         assert self.best is not None
         self.correction, self.gain, self.returns = self.best.correction, 0.5 * self.gain, self.returns + 1
-        self._returned = True
+        # What was learned from passes that had not settled may be wrong: the gains are learned anew, and how long it
+        # takes to settle.
+        self._returned, self._dwell, self._ring_since = True, None, 0
+        self.harmonics = self.harmonics.doubted(self._guess)
         self._told = f"{why}; back to the best, at half the gain"
         if self.returns >= MOST_RETURNS:
-            self.held = f"held: {why}, for the second time"
+            self.held = f"{HELD}: {why}, for the second time"
 
     def _refuse(self, reason: str, *, new: bool) -> None:
         """Leave a pass alone, and go back to the best path from a new one; after several in a row, hold."""
         self._told = reason
         self.refused += 1
         if self.best is not None and (new or self.refused >= MOST_REFUSED):
-            self.correction, self._returned = self.best.correction, True
+            self.correction, self._returned, self._ring_since = self.best.correction, True, 0
         if self.refused >= MOST_REFUSED:
-            self.held = f"held: {MOST_REFUSED} passes in a row were not learned from, the last as {reason}"
+            self.held = f"{HELD}: {MOST_REFUSED} passes in a row were not learned from, the last as {reason}"
 
     def limited_by(self, drift: float) -> str:
         """Return what keeps the error where it is: noise, bandwidth, learn_limit, voltage range, drift, or learning."""
@@ -363,6 +439,7 @@ class AxisLearner:
             "changed_m": _listed(self._changed),
             "lead_in_m": _listed(self._lead_in),
             "since": self._since,
+            "ring_since": self._ring_since,
             "dwell": self._dwell,
             "returned": self._returned,
             "record_m2": self.record if math.isfinite(self.record) else None,
@@ -398,15 +475,16 @@ class AxisLearner:
         if correction.shape != self.desired.shape:
             raise ModelError(f"{correction.size} corrections for a path of {self.desired.size} samples; learn it anew")
         low, high = -self.limit, self.limit
-        self.correction = self._last = np.clip(correction, low, high)
+        self.correction = self._last = self._before = self._aimed = np.clip(correction, low, high)
         if not same_model:
             return
         numbers, h = document["harmonics"], self.harmonics
         if len(numbers["noise_m2"]) != h.noise.size:
             raise ModelError(f"{len(numbers['noise_m2'])} harmonics, not {h.noise.size}; learn the path anew")
-        self._last = np.array(document["last_correction_m"])
+        self._last = self._aimed = np.array(document["last_correction_m"])
         self._previous, self._changed = _array(document["previous_m"]), _array(document["changed_m"])
         self._lead_in, self._since = _array(document["lead_in_m"]), document["since"]
+        self._ring_since = document["ring_since"]
         self._dwell, self._returned = document["dwell"], document["returned"]
         self.record = math.inf if document["record_m2"] is None else document["record_m2"]
         self.gain, self.held = document["gain"], document["held"]
@@ -428,6 +506,16 @@ class AxisLearner:
             noise=np.array(numbers["noise_m2"]),
             passes=numbers["passes"],
         )
+
+
+def _passes_until_settled(duration: float, ringing: float) -> int:
+    """Return from which pass (`duration`, s) after a change on a mode that rings (s) has settled to `SETTLED`."""
+    if ringing <= 0.0:
+        return 1
+    share = duration / ringing
+    # Mean of the decay over the first pass; each further one is less by exp(-share).
+    first = -math.expm1(-share) / share
+    return min(1 + max(math.ceil(math.log(first / SETTLED) / share), 0), MOST_DWELL)
 
 
 def _listed(x: FloatArray | None) -> list[float] | None:

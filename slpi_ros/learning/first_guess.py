@@ -1,5 +1,6 @@
 """First guess of the gains of a path that repeats: what the identified dynamics say, and how sure they are."""
 
+import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -53,6 +54,12 @@ def first_guess(axis: AxisModel, dt: float, frequency: FloatArray) -> tuple[Comp
         # A model that does not answer a small signal tells nothing.
         return plain, variance
     return gain, variance
+
+
+def ringing(axis: AxisModel) -> list[tuple[float, float]]:
+    """Return frequency (Hz) of each identified mode, and the time (s) in which it falls by the factor e."""
+    modes = [mode for effect in axis.stage_only.effects for mode in getattr(effect, "modes", ())]
+    return [(mode.frequency, 1.0 / (2.0 * math.pi * mode.frequency * mode.damping)) for mode in modes]
 
 
 class _Test:

@@ -106,13 +106,21 @@ class Harmonics:
             without_variance=self.noise.copy(), passes=1,
         )  # fmt: skip
 
-    def after(self, correction: ComplexArray, reading: ComplexArray) -> "Harmonics":
+    def doubted(self, first: "Harmonics") -> "Harmonics":
+        """Return the same with gains that may be wrong by as much as those of the first guess."""
+        variance = np.maximum(self.gain_variance, first.gain_variance)
+        # The correlation with the repeating error is lost with what it came from.
+        return replace(self, gain_variance=variance, covariance=np.zeros_like(self.covariance))
+
+    def after(self, correction: ComplexArray, reading: ComplexArray, due: Mask) -> "Harmonics":
         """Return what is known after another pass.
 
         Parameters
         ----------
         correction, reading : ndarray of complex, (K,), metres
             Correction of the desired path in this pass, and what was measured.
+        due : ndarray of bool, (K,)
+            Harmonics to learn of; the others stay.
         """
         unexpected = reading - self.expected(correction)
         before = self.variance(correction) + self.noise
@@ -124,12 +132,14 @@ class Harmonics:
         k_gain, k_rest = with_gain / total, with_rest / total
         return replace(
             self,
-            gain=self.gain + k_gain * unexpected,
-            without=self.without + k_rest * unexpected,
-            gain_variance=np.maximum(a - np.abs(k_gain) ** 2 * total, LEAST_VARIANCE),
-            without_variance=np.maximum(b - np.abs(k_rest) ** 2 * total, 0.0),
-            covariance=self.covariance - k_gain * k_rest.conj() * total,
-            noise=self._noise_after(np.abs(unexpected) ** 2, before),
+            gain=np.where(due, self.gain + k_gain * unexpected, self.gain),
+            without=np.where(due, self.without + k_rest * unexpected, self.without),
+            gain_variance=np.where(
+                due, np.maximum(a - np.abs(k_gain) ** 2 * total, LEAST_VARIANCE), self.gain_variance
+            ),
+            without_variance=np.where(due, np.maximum(b - np.abs(k_rest) ** 2 * total, 0.0), self.without_variance),
+            covariance=np.where(due, self.covariance - k_gain * k_rest.conj() * total, self.covariance),
+            noise=np.where(due, self._noise_after(np.abs(unexpected) ** 2, before), self.noise),
             passes=self.passes + 1,
         )
 

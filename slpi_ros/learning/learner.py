@@ -40,7 +40,7 @@ class Learner:
         The desired path.
     axis : str, optional
         The axis that an array without name is of; default: that of a model with one axis.
-    learn_limit : float, optional, metres
+    learn_limit : float or mapping of axis name to float, optional, metres
         Most that learning may add to the desired path; default: a quarter of the identified stroke.
     limits : (float, float), optional, volts
         Voltage limits; default: the identified voltage range of each axis.
@@ -58,7 +58,7 @@ class Learner:
         desired: Signal,
         *,
         axis: str | None = None,
-        learn_limit: float | None = None,
+        learn_limit: float | Mapping[str, float] | None = None,
         limits: tuple[float, float] | None = None,
     ) -> None:
         self.model, self._named = model, isinstance(desired, Mapping)
@@ -69,8 +69,10 @@ class Learner:
         dt = self._interval = round(float(self.t[-1] - self.t[0]) / (self.t.size - 1), 12)
         if not dt > 0.0 or float(np.abs(np.diff(self.t) - dt).max()) > UNEVEN * dt:
             raise UsageError("the times of a pass are not evenly spaced; interpolate the path at even times")
-        if learn_limit is not None and not 0.0 < learn_limit < np.inf:
-            raise UsageError(f"learn_limit is {learn_limit}; give a positive number of metres")
+        most = dict(learn_limit) if isinstance(learn_limit, Mapping) else dict.fromkeys(model.axes, learn_limit)
+        for each in most.values():
+            if each is not None and not 0.0 < each < np.inf:
+                raise UsageError(f"learn_limit is {each}; give a positive number of metres")
         self._default = axis or (next(iter(model.axes)) if len(model.axes) == 1 else "")
         self.axes: dict[str, AxisLearner] = {}
         for name, path in self._by_axis(desired, "desired").items():
@@ -79,13 +81,20 @@ class Learner:
             one = model.axis(name)
             low, high = one.voltage_range
             allowed = (low, high) if limits is None else (max(low, limits[0]), min(high, limits[1]))
-            self.axes[name] = AxisLearner(one, dt, path, learn_limit, allowed)
+            self.axes[name] = AxisLearner(one, dt, path, most.get(name), allowed)
 
     def path(self) -> Any:
         """Return what to compensate in the next pass, metres, in the form of `desired`; at first the desired path."""
         return self._in_form({name: axis.path for name, axis in self.axes.items()})
 
-    def update(self, measured: Signal, voltage: Signal | None = None, *, followed: Signal | None = None) -> Any:
+    def update(
+        self,
+        measured: Signal,
+        voltage: Signal | None = None,
+        *,
+        followed: Signal | None = None,
+        unusable: Mapping[str, str] | None = None,
+    ) -> Any:
         """Learn from the pass that has just ended.
 
         Parameters
@@ -97,6 +106,8 @@ class Learner:
         followed : as `desired`, optional, metres
             What was asked of the compensator in the pass; default: the last `path`. A pass that had begun before `path`
             was known, or that was repeated by hand, followed an earlier one.
+        unusable : mapping of axis name to str, optional
+            Why the pass is not to be learned from, if that is known: a limit held the voltage back.
 
         Returns
         -------
@@ -108,8 +119,12 @@ class Learner:
         if missing := self.axes.keys() - seen.keys():
             raise UsageError(f"no readings of axis '{min(missing)}'; give those of every axis of the path")
         asked = {} if followed is None else self._by_axis(followed, "followed")
+        why = unusable or {}
         return self._in_form(
-            {name: axis.update(seen[name], applied.get(name), asked.get(name)) for name, axis in self.axes.items()}
+            {
+                name: axis.update(seen[name], applied.get(name), asked.get(name), why.get(name, ""))
+                for name, axis in self.axes.items()
+            }
         )
 
     @property

@@ -31,6 +31,7 @@ from slpi_ros.compensator.validation import STALE, RejectedError
 from slpi_ros.errors import ModelError, SlpiError, shown
 from slpi_ros.io.cdr import multiarray_header
 from slpi_ros.io.messages import SECOND_NS, JointStates, decode_trajectory, encode_trajectory
+from slpi_ros.learning.axis_learner import HELD
 from slpi_ros.model.document import load_model
 from slpi_ros.model.limits import volts
 from slpi_ros.model.stage_model import StageModel
@@ -51,6 +52,7 @@ from slpi_ros.nodes.compensator_diagnostics import Reporter
 from slpi_ros.nodes.compensator_parameters import DECLARATIONS, CompensatorSettings
 from slpi_ros.nodes.jobs import Read, Reading
 from slpi_ros.nodes.parameters import Parameters
+from slpi_ros.nodes.path_learning import OFF, PathLearning
 from slpi_ros.nodes.surroundings import SurroundingsTopics
 
 # Minimum time between two log messages of the same kind, seconds.
@@ -82,7 +84,7 @@ class Compensator(LifecycleNode):
     Subscribes to ``desired_displacement``, ``desired_trajectory``, ``measured_displacement``, ``stage_state``,
     ``stage_model``, ``voltage_trajectory_state`` and the topics of the quantities that the stage follows, publishes
     ``voltage_command``, ``voltage_trajectory``, ``tracking_error`` and ``/diagnostics``, provides the services
-    ``~/reset_memory``, ``~/set_zero`` and ``~/arm``.
+    ``~/reset_memory``, ``~/set_zero``, ``~/forget`` and ``~/arm``.
     Message types, units and QoS are documented in ``msg_schemas/README.md``, parameters in `compensator_parameters`.
     """
 
@@ -97,6 +99,9 @@ class Compensator(LifecycleNode):
             values["axes"], told.limits, values["hardware_id"], told.time, told.loops, told.period, told.starts
         )
         self._parameter_set.follow(self._use_settings, check=self._check_settings)
+        learned_files = f"{values['memory_file']}.learned" if values["memory_file"] else ""
+        self._learning = PathLearning(self._controller, learned_files, self._on_forgotten)
+        self._use_learning(told)
         self._desired, self._measured = JointStates(), JointStates()
         self._voltage_header = multiarray_header(len(values["axes"]))
         self._failure: SlpiError | None = None
@@ -108,6 +113,8 @@ class Compensator(LifecycleNode):
         self._keeps_memory = values["memory_file"] != ""
         self._reporter = Reporter(self, self._controller)
         self._reset_service = DeferredService(self, "~/reset_memory", self._on_reset)
+        self._forget_service = DeferredService(self, "~/forget", self._on_forget)
+        self._learning_held: set[str] = set()
         self.create_service(Trigger, "~/arm", self._on_arm)
         self.create_service(Trigger, "~/set_zero", self._on_set_zero)
         self._doubts: dict[str, str] = {}
@@ -158,6 +165,12 @@ class Compensator(LifecycleNode):
         self._controller.use_limits(new.limits, time.monotonic_ns(), new.period)
         self._controller.use_loops(new.loops)
         self._controller.use_time(new.time)
+        self._use_learning(new)
+
+    def _use_learning(self, settings: CompensatorSettings) -> None:
+        values, limits = settings.values, settings.values["learn_limit"]
+        most = dict(zip(values["axes"], limits, strict=True)) if limits else None
+        self._learning.use(values["learn"], most, values["learn_period"])
 
     # Lifecycle
 
@@ -261,6 +274,7 @@ class Compensator(LifecycleNode):
         """Deactivate as `on_deactivate` does, then destroy the node."""
         self._stop_reading()
         self._end_activity()
+        self._learning.close()
         super().destroy_node()
 
     def _end_activity(self) -> None:
@@ -324,7 +338,10 @@ class Compensator(LifecycleNode):
 
     def _on_measured(self, data: bytes) -> None:
         stamp_ns, names, displacements = self._measured.read(data) or as_rclpy_reads(data)
-        fresh = not stamp_ns or -EARLIEST_NS <= self.get_clock().now().nanoseconds - stamp_ns <= OLDEST_NS
+        age_ns = self.get_clock().now().nanoseconds - stamp_ns if stamp_ns else 0
+        fresh = -EARLIEST_NS <= age_ns <= OLDEST_NS
+        if self._learning.passes.on and fresh:
+            self._learning.passes.read(names, displacements, self._clocks()[1] - age_ns)
         try:
             self._controller.measure(names, displacements, time.monotonic_ns(), fresh)
         except RejectedError as error:
@@ -474,11 +491,13 @@ class Compensator(LifecycleNode):
         if self._settings.values["trajectory_output"] == "block" and len(times):  # type: ignore[arg-type]
             self._send_block(names, times, positions, start_ns > clock_ns)
             return
+        path, (names, times, positions) = self._learning.corrected(names, times, positions)
         try:
             controller.follow(names, times, positions, start_ns, now_ns, clock_ns)
         except RejectedError as error:
             self._reject("trajectory ", error)
             return
+        self._learning.begin(path, start_ns, clock_ns)
         self._on_simulated = self._simulated
         self.get_logger().info(f"trajectory: {controller.trajectory.remaining} points to come")
         self._too_fast = ""
@@ -605,6 +624,8 @@ class Compensator(LifecycleNode):
         held = controller.counts.points_held
         if controller.advance(now_ns, clock_ns):
             self._publish()
+            if self._learning.passes.on:
+                self._learning.passes.output(controller.axes, clock_ns)
             if before is OperatingMode.TRAJECTORY and deadline_ns is not None and deadline_ns <= clock_ns:
                 self._reporter.lateness.note(deadline_ns, clock_ns)
             if controller.counts.points_held > held or controller.counts.excursions > self._excursions:
@@ -634,6 +655,7 @@ class Compensator(LifecycleNode):
 
     def _watch(self) -> None:
         controller, values, now_ns = self._controller, self._settings.values, time.monotonic_ns()
+        self._watch_learning()
         if not controller.active:
             return
         self._work_off()
@@ -658,6 +680,28 @@ class Compensator(LifecycleNode):
             self._report()
         self._publish_tracking_errors()
 
+    def _watch_learning(self) -> None:
+        """Take what was learned, and log once what keeps it from going on."""
+        learning = self._learning
+        if learning.mode == OFF and not learning.waiting:
+            return
+        learning.poll(self._clocks()[1])
+        while learning.remarks:
+            self.get_logger().warning(learning.remarks.popleft())
+        held = {name for name, one in learning.progress.items() if one.limited_by.startswith(HELD)}
+        for name in held - self._learning_held:
+            self.get_logger().warning(f"axis '{name}': learning is {learning.progress[name].limited_by}; call ~/forget")
+        self._learning_held = held
+
+    def _on_forget(self) -> str:
+        """Forget what was learned; answered when the files are removed."""
+        self._learning.forget()
+        return ""
+
+    def _on_forgotten(self, count: int) -> None:
+        self._forget_service.answer(True, f"forgotten: {count} {'path' if count == 1 else 'paths'}")
+        self._report()
+
     def _publish_tracking_errors(self) -> None:
         """Publish the tracking errors of all axes if any axis was measured since the last call."""
         axes = self._controller.axes
@@ -673,7 +717,7 @@ class Compensator(LifecycleNode):
 
     def _report(self) -> None:
         self._measures_age = True
-        self._reporter.report(self._settings)
+        self._reporter.report(self._settings, self._learning)
 
     def _report_at_least(self, level: bytes) -> None:
         """Publish the diagnostics now if the level of the last report was lower than `level`."""
@@ -743,6 +787,7 @@ class Compensator(LifecycleNode):
                 shown(f"using the model of {source}, identified {model.created or 'at an unknown time'}")
             )
             reporter.model_id = fingerprint
+            self._learning.use_model(controller.identified)
             if controller.active:
                 self._save_memory(complete=False)
                 self._begin_memory()

@@ -11,9 +11,11 @@ from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.feedback import Drift
 from slpi_ros.compensator.persistence import KNOWN, RESETTING, RESTORED
 from slpi_ros.compensator.statistics import Timing, TimingReport
+from slpi_ros.learning.axis_learner import HELD
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes.common import ERROR, WARN, Diagnostics, Health
 from slpi_ros.nodes.compensator_parameters import CompensatorSettings
+from slpi_ros.nodes.path_learning import OFF, PathLearning
 
 Problem = tuple[bool, bytes, str]
 # Residuals are a constant if their mean is more than the first share of their rms, and have none below the second.
@@ -43,10 +45,12 @@ class Reporter:
         """Diagnostic level of the last report."""
         return self._diagnostics.level
 
-    def report(self, settings: CompensatorSettings) -> None:
+    def report(self, settings: CompensatorSettings, learning: PathLearning) -> None:
         """Publish the diagnostics."""
         model = self._controller.model
         values = self._counters() | self._timing_values() | self._model_values(model)
+        if learning.mode != OFF:
+            values |= _learning_values(learning)
         if model:
             for axis in self._controller.axes:
                 values |= _axis_values(axis, model.created)
@@ -57,6 +61,9 @@ class Reporter:
                 values[f"{key}.value"] = f"{one.value:.6g}" if age is not None else ""
                 values[f"{key}.age_s"] = f"{age * 1e-9:.3f}" if age is not None else ""
         problems = tuple((level, text) for wrong, level, text in self._problems(settings) if wrong)
+        for name, progress in learning.progress.items():
+            if progress.limited_by.startswith(HELD):
+                problems = (*problems, (WARN, f"axis '{name}': learning is {progress.limited_by}"))
         hardware_id = settings.values["hardware_id"] or (model.hardware_id if model else "")
         self._diagnostics.report(Health(problems, self._summary(), values, hardware_id))
 
@@ -270,6 +277,20 @@ def _axis_problems(axis: Axis, factor: float, moving: bool) -> Iterator[Problem]
             f"{drift.samples} measurements; held-out error {usual * 1e9:.1f} nm: {remedy(axis, drift)}"
         )
         yield 0.0 < factor * usual < drift.rms, WARN, text
+
+
+def _learning_values(learning: PathLearning) -> dict[str, object]:
+    values: dict[str, object] = {"learn": learning.mode, "learn_dropped": learning.dropped}
+    for name, one in learning.progress.items():
+        values |= {
+            f"{name}.learn_pass": one.passes,
+            f"{name}.learn_error_nm": f"{one.error * 1e9:.2f}",
+            f"{name}.learn_first_nm": f"{one.first * 1e9:.2f}",
+            f"{name}.learn_best_nm": f"{one.best * 1e9:.2f}",
+            f"{name}.learn_limited_by": one.limited_by,
+            f"{name}.learn_reason": one.reason,
+        }
+    return values
 
 
 def remedy(axis: Axis, drift: Drift) -> str:

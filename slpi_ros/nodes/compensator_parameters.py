@@ -182,6 +182,23 @@ DECLARATIONS = (
         "/diagnostics warns if the rms of measured - model exceeds this many times the held-out error; 0: never.",
         (0.0, 1e6),
     ),
+    # Learning
+    text(
+        "learn", "off",
+        "Whether a desired_trajectory that comes again is corrected by what its passes measured: off, on, or hold "
+        "(what was learned is used, and no more is learned). Kept in files beside memory_file.",
+        "off", "on", "hold",
+    ),
+    scalar(
+        "learn_period", 0.0,
+        "Period of the axes that repeat within a trajectory, seconds: each period is a pass (the fast axis of a "
+        "raster, while the slow one moves on). 0: a trajectory is one pass.",
+        TIMEOUT,
+    ),
+    each_axis(
+        "learn_limit", nan,
+        "Most that learning adds to a desired displacement, metres; NaN: a quarter of the stroke.", (1e-12, 1.0),
+    ),
     # The node
     Declaration("autostart", True, "Whether the node configures and activates itself.", read_only=True),
     text(
@@ -222,6 +239,11 @@ class CompensatorSettings:
             raise UsageError(
                 f"model_sha256 {values['model_sha256']!r} is not 64 hexadecimal digits in lower case; give the output "
                 "of sha256sum, or nothing"
+            )
+        if values["learn"] != "off" and values["trajectory_output"] == "block":
+            raise UsageError(
+                f"learn is {values['learn']!r}, and trajectory_output is 'block': passes that a device plays by itself "
+                "are learned by slpi learn, from the bags; set learn to off, or trajectory_output to stream"
             )
         gains = zip(values["kp"], values["ki"], values["kd"], values["derivative_filter"], strict=True)
         timeout = values["measurement_timeout"]

@@ -279,7 +279,7 @@ class Reading:
             model = parse_model(self._document, self._source)
             return model, model_id(model)
         try:
-            with _normal_scheduling():
+            with normal_scheduling():
                 request = self._document, self._source
                 checking = WorkerProcess(check, request, CheckOutcome, f"{self._source}: the check of the model")
         except OSError as error:
@@ -296,7 +296,7 @@ class Reading:
 
 
 @contextmanager
-def _normal_scheduling() -> Iterator[None]:
+def normal_scheduling() -> Iterator[None]:
     """Start child processes with normal scheduling, even if this thread has real-time priority."""
     if not hasattr(os, "sched_getscheduler") or os.sched_getscheduler(0) == os.SCHED_OTHER:
         yield

@@ -42,9 +42,16 @@ class Declaration:
             low, high = map(int, self.between)
             if isinstance(given, bool) or not isinstance(given, int) or not low <= given <= high:
                 raise UsageError(f"parameter {self.name} is {given!r}; give a whole number from {low} to {high}")
+        if self._is_switch and isinstance(given, bool):
+            given = "on" if given else "off"
         if self.choices and given not in self.choices:
             raise UsageError(f"parameter {self.name} is {given!r}; choose one of {', '.join(self.choices)}")
         return given
+
+    @property
+    def _is_switch(self) -> bool:
+        """Whether it is on or off, which YAML takes for true and false."""
+        return "on" in self.choices
 
     @staticmethod
     def _is_nan(value: Any) -> bool:
@@ -53,7 +60,9 @@ class Declaration:
     def descriptor(self) -> ParameterDescriptor:
         """Return the ROS descriptor, with the range that rclpy checks unless the default, NaN, is outside of it."""
         described = ParameterDescriptor(
-            description=self.description, read_only=self.read_only, dynamic_typing=self.number
+            description=self.description,
+            read_only=self.read_only,
+            dynamic_typing=self.number or self._is_switch,
         )
         if self.between and not self._is_nan(self.default):
             low, high = self.between

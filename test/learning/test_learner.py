@@ -11,6 +11,8 @@ from identification.records import calibration
 from scipy.signal import cont2discrete, lfilter
 
 import slpi_ros
+from slpi_ros.effects.filters import Mode
+from slpi_ros.effects.resonance import Resonance
 from slpi_ros.errors import ModelError, UsageError
 from slpi_ros.learning.axis_learner import MOST_REFUSED
 from slpi_ros.learning.harmonics import PHASE_KNOWN, Harmonics
@@ -34,13 +36,17 @@ def path(hertz=20.0, amplitude=4e-6):
 class Stage:
     """What is left behind the inverse of a stage: 3 % of plays, a lag, and a flexure mode; noise of the sensor."""
 
-    def __init__(self, start, seed=0, frequency=300.0, damping=0.1, noise=NOISE):
+    def __init__(self, start, seed=0, frequency=300.0, damping=0.1, noise=NOISE, inverted=None):
         self._widths = np.linspace(0.1e-6, 3e-6, 8)
         self._plays = np.full(8, start)
         w = 2 * np.pi * frequency
+        answer = [w * w]
+        if inverted:
+            taken, share = 2 * np.pi * inverted[0], inverted[1]
+            answer = [w * w / taken**2, 2 * share * w * w / taken, w * w]
         self._filters = [
             cont2discrete((numerator, denominator), 1 / RATE, method="foh")[:2]
-            for numerator, denominator in (([1.0], [0.3e-3, 1.0]), ([w * w], [1.0, 2 * damping * w, w * w]))
+            for numerator, denominator in (([1.0], [0.3e-3, 1.0]), (answer, [1.0, 2 * damping * w, w * w]))
         ]
         self._states = [np.zeros(len(denominator) - 1) for _, denominator in self._filters]
         self._noise, self._rng, self._start = noise, np.random.default_rng(seed), start
@@ -84,6 +90,26 @@ def test_a_light_mode_that_no_model_told_of_does_no_harm(model):
     _, desired = path()
     _, _, errors = learned(model, 20, Stage(desired[0], frequency=240.0, damping=0.01))
     assert errors[-1] < 0.3 * errors[0]
+    assert max(errors[2:]) < 1.1 * max(errors[:2])
+
+
+@pytest.mark.parametrize("hertz", [15.0, 20.0, 40.0])
+def test_a_mode_that_rings_from_pass_to_pass_is_waited_for(model, hertz):
+    mode = Resonance(modes=(Mode(frequency=223.0, damping=0.01, gain=1.0),))
+    told = slpi_ros.StageModel({"x": replace(model.axes["x"], effects=(mode,))})
+    t, desired = path(hertz)
+    learner, stage = (
+        slpi_ros.Learner(told, t, desired),
+        Stage(desired[0], frequency=226.0, damping=0.01, inverted=(223.0, 0.01)),
+    )
+    errors = []
+    for _ in range(25):
+        true, read = stage.run(learner.path())
+        errors.append(float(np.std(true - desired)))
+        learner.update(read)
+
+    assert errors[-1] < 0.3 * errors[1]
+    # The first passes follow the desired path itself, while the mode begins to ring.
     assert max(errors[2:]) < 1.1 * max(errors[:2])
 
 

@@ -52,6 +52,7 @@ WRONG = [
     {"ki": -1.0}, {"kd": math.nan}, {"derivative_filter": math.inf}, {"acceleration_limit": -1.0}, {"time_jump": 0.0},
     {"start_voltage": "there"}, {"start_voltage": "1,2"}, {"start_voltage": "inf"}, {"start_voltage": "500"},
     {"output_rate": 0.0}, {"correction_limit": -1.0}, {"reset_min": 120.0}, {"reset_max": -1.0}, {"slew_limit": -1.0},
+    {"learn": "always"}, {"learn_period": -1.0}, {"learn_limit": 0.0},
     {"max_age": -1.0}, {"drift_alarm": -3.0}, {"measurement_timeout": "long"}, {"start_memory": "yesterday"},
 ]  # fmt: skip
 
@@ -62,6 +63,15 @@ def test_a_value_that_makes_no_sense_is_named(values):
     with pytest.raises(UsageError) as caught:
         settings(**values)
     assert name in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_learning_is_off_and_takes_what_yaml_makes_of_on_and_off():
+    told = settings().values
+    assert (told["learn"], told["learn_period"], told["learn_limit"]) == ("off", 0.0, None)
+    assert [settings(learn=given).values["learn"] for given in (True, False, "hold")] == ["on", "off", "hold"]
+    assert settings(axes=["x", "y"], learn_limit=[1e-7, 2e-7]).values["learn_limit"] == (1e-7, 2e-7)
+    with pytest.raises(UsageError, match="learn is 'on', and trajectory_output is 'block'"):
+        settings(learn="on", trajectory_output="block")
 
 
 @pytest.mark.parametrize("use", [{"on_timeout": "safe"}, {"on_deactivate": "safe"}, {"reset_to": "safe"}])

@@ -1,0 +1,240 @@
+"""What the compensator learns of paths that come again: in a process of its own, so that no command waits for it."""
+
+import multiprocessing
+import os
+import signal
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+from multiprocessing.connection import Connection
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from slpi_ros.compensator.controller import Controller, OperatingMode
+from slpi_ros.compensator.path_passes import ComingAgain, PassRecorder, PathPasses
+from slpi_ros.compensator.trajectory import Trajectory
+from slpi_ros.compensator.validation import RejectedError
+from slpi_ros.learning.repeated_paths import AxisProgress, Learned, RepeatedPaths, SampledPath
+from slpi_ros.model.document import format_model, parse_model
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.nodes.jobs import normal_scheduling
+
+OFF, ON = "off", "on"
+# How much less urgent the process is than the node.
+NICENESS = 10
+# Requests that wait for the process; passes that come with more are not learned from.
+MOST_WAITING = 4
+
+
+@dataclass(frozen=True)
+class Opening:
+    """Request to go on from the files that begin with `prefix`, with a model document and limits (m; None: usual)."""
+
+    document: str
+    prefix: str
+    limit: Mapping[str, float] | None
+
+
+@dataclass(frozen=True)
+class Forgetting:
+    """Request to forget everything, and to remove the files that begin with `prefix`."""
+
+    prefix: str
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What is known of paths; why the last pass that tells nothing does not; how many paths were forgotten, if so."""
+
+    learned: Sequence[Learned] = ()
+    dropped: str = ""
+    forgotten: int | None = None
+
+
+Request = Opening | tuple[PassRecorder, ...] | Forgetting
+
+
+def serve(connection: Connection) -> None:
+    """Answer requests until the other end is closed."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    os.nice(NICENESS)
+    paths, again = RepeatedPaths(StageModel({})), ComingAgain()
+    while True:
+        try:
+            request: Request = connection.recv()
+        except (EOFError, OSError):
+            return
+        if isinstance(request, Opening):
+            before = paths
+            paths = RepeatedPaths(parse_model(request.document, "the model"), request.prefix, request.limit)
+            answer = Answer([*paths.take_over(before), *paths.load()])
+        elif isinstance(request, tuple):
+            learned = paths.learn(*again.of(request, paths.known))
+            answer = Answer(learned, again.dropped)
+        else:
+            paths.prefix, again = request.prefix, ComingAgain()
+            answer = Answer(forgotten=paths.forget())
+        connection.send(answer)
+
+
+class PathLearning:
+    """Correct the trajectories of the controller by what was learned of them, and learn from their passes.
+
+    `prefix` begins the names of the files that are kept; "": none. `on_forgotten` is called in the thread of `poll`
+    with the number of paths.
+    """
+
+    def __init__(self, controller: Controller, prefix: str, on_forgotten: Callable[[int], None]) -> None:
+        self.passes = PathPasses()
+        self.mode, self.period = OFF, 0.0
+        self.limit: Mapping[str, float] | None = None
+        self.progress: dict[str, AxisProgress] = {}  # of the path that came last, by axis
+        self.dropped = ""  # why the last pass that tells nothing does not
+        self.remarks: deque[str] = deque()  # to be logged
+        self._controller, self._prefix, self._on_forgotten = controller, prefix, on_forgotten
+        self._model: StageModel | None = None
+        self._opened = False
+        self._thread = ThreadPoolExecutor(1, "learning")
+        self._process: Any = None
+        self._connection: Connection | None = None
+        self._answers: deque[tuple[int, Answer]] = deque()
+        self._era = 0  # answers to requests of an earlier one are void
+        self.waiting = 0  # requests that the process has not answered yet
+
+    def use(self, mode: str, limit: Mapping[str, float] | None, period: float) -> None:
+        """Learn (`on`), follow what was learned (`hold`) or neither (`off`).
+
+        At most `limit` (m, by axis) is added; `period` (s): of paths that repeat within a trajectory, 0: none.
+        """
+        changed = limit != self.limit
+        self.mode, self.limit, self.period = mode, limit, period
+        if mode == OFF:
+            self.passes.forget()
+            self.progress = {}
+            self._opened, self._era = False, self._era + 1
+            if self._process is not None:
+                self._thread.submit(self._stop)
+        elif changed or not self._opened:
+            self._open()
+
+    def use_model(self, model: StageModel | None) -> None:
+        """Take another model: what was learned with the last one is learned afresh."""
+        if self._model is not None and model is not None and model.hardware_id != self._model.hardware_id:
+            # Those of another stage.
+            self.passes.corrections.clear()
+        self._model = model
+        if self.mode != OFF:
+            self._open()
+
+    def _open(self) -> None:
+        """Let the process go on from the kept files, with the present model."""
+        if self._model is None:
+            return
+        self._era, self._opened = self._era + 1, True
+        model, prefix, limit = self._model, self._prefix, self.limit
+        self._ask(lambda: Opening(format_model(model), prefix, limit))
+
+    def corrected(
+        self, names: Sequence[str], times: ArrayLike, positions: ArrayLike
+    ) -> tuple[SampledPath | None, tuple[Sequence[str], ArrayLike, ArrayLike]]:
+        """Return the path of a trajectory, None if none is learned, and the trajectory with what was learned of it."""
+        plain = names, times, positions
+        if self.mode == OFF or not len(times):  # type: ignore[arg-type]
+            return None, plain
+        self.poll(0)
+        period = self._controller.trajectory.period
+        try:
+            valid = Trajectory.of(names, times, positions, axes=self._controller.names)
+        except RejectedError:
+            return None, plain
+        path = SampledPath.of(valid.names, valid.time_from_start_ns, valid.positions, period, self.period)
+        correction = self.passes.corrections.get(path.identity) if path else None
+        return path, (path.corrected(correction, period) if path and correction else plain)
+
+    def begin(self, path: SampledPath | None, start_ns: int, clock_ns: int) -> None:
+        """Take notice of a trajectory that was accepted; None: it is not learned."""
+        if path is None:
+            self.passes.end(start_ns or clock_ns)
+            return
+        self.passes.begin(path, start_ns, clock_ns, self._controller.trajectory.period, self.mode == ON)
+
+    def poll(self, clock_ns: int) -> None:
+        """Take what has been learned, and have passes learned that have ended."""
+        while self._answers:
+            era, answer = self._answers.popleft()
+            self.waiting -= 1
+            self.dropped = answer.dropped or self.dropped
+            if answer.forgotten is not None:
+                self.dropped = ""
+                self._on_forgotten(answer.forgotten)
+                if self.mode == OFF:
+                    self._thread.submit(self._stop)
+                continue
+            for one in answer.learned:
+                self.remarks.extend(one.remarks)
+                if era == self._era and one.identity:
+                    self.passes.corrections[one.identity] = one.correction
+                    self.progress = dict(one.axes)
+        if self.mode != OFF and not self._opened:
+            self._open()
+        if clock_ns and self.passes.on:
+            if self._controller.mode is not OperatingMode.TRAJECTORY:
+                self.passes.end(clock_ns)
+            done = tuple(self.passes.take(clock_ns))
+            if done and self.waiting < MOST_WAITING:
+                self._ask(partial(_given, done))
+
+    def forget(self) -> None:
+        """Begin anew from the desired paths; `on_forgotten` is called when the files are removed."""
+        self.passes.forget()
+        self.progress = {}
+        self._era += 1
+        prefix = self._prefix
+        self._ask(lambda: Forgetting(prefix))
+
+    def close(self) -> None:
+        """End the process."""
+        self._thread.shutdown(wait=False, cancel_futures=True)
+        self._stop()
+
+    def _ask(self, request: Callable[[], Request]) -> None:
+        self.waiting += 1
+        self._thread.submit(self._answer, self._era, request)
+
+    def _answer(self, era: int, request: Callable[[], Request]) -> None:
+        """Send a request to the process, which is started if there is none; wait for its answer."""
+        try:
+            wanted = request()
+            if self._process is None or not self._process.is_alive():
+                if isinstance(wanted, tuple):
+                    # A new process has to be given the model first.
+                    raise EOFError
+                self._start()
+            assert self._connection
+            self._connection.send(wanted)
+            answer = self._connection.recv()
+        except (EOFError, OSError):
+            self._process, self._opened = None, False
+            answer = Answer(
+                [Learned("", {}, {}, ("the process that learns has ended: learning goes on from the files",))]
+            )
+        self._answers.append((era, answer))
+
+    def _stop(self) -> None:
+        if self._process is not None:
+            self._process.kill()
+
+    def _start(self) -> None:
+        context = multiprocessing.get_context("spawn")
+        self._connection, other = context.Pipe()
+        self._process = context.Process(target=serve, args=(other,), daemon=True)
+        with normal_scheduling():
+            self._process.start()
+        other.close()
+
+
+def _given(request: Request) -> Request:
+    return request

@@ -87,11 +87,14 @@ class AxisUncertainty:
     ----------
     axis : AxisModel
     start_memory : str
-        Assumed initial state, as for `StageModel.compensate`: after ``wiped`` the memory is known, otherwise the stage
-        may have moved since.
+        Assumed initial state, as for `StageModel.compensate`.
+    known_memory : bool, optional
+        Whether this state is known. By default only that after ``wiped``: otherwise the stage may have moved since.
     """
 
-    def __init__(self, axis: AxisModel, start_memory: StartMemory = "end") -> None:
+    def __init__(
+        self, axis: AxisModel, start_memory: StartMemory = "end", known_memory: bool | None = None
+    ) -> None:
         quality = axis.quality
         if quality.regions is None or quality.drift is None or quality.duration is None or quality.fastest is None:
             raise ModelError(
@@ -104,7 +107,7 @@ class AxisUncertainty:
                 "identify kind 'slpi'"
             )
         self._axis, self._start_memory = axis, start_memory
-        self.known_memory = start_memory == "wiped"
+        self.known_memory = start_memory == "wiped" if known_memory is None else known_memory
         self.low, high = axis.displacement_range
         self.stroke = high - self.low
         self.scale = (POINTS - 1) / self.stroke
@@ -229,7 +232,7 @@ class AxisUncertainty:
 
     def at(self, y: float, age: float) -> Budget:
         """Return the budget, shape (1,), at a displacement (m) and a time (s) since a reset, at rates of the record."""
-        known = AxisUncertainty(self._axis, "wiped") if not self.known_memory else self
+        known = self if self.known_memory else AxisUncertainty(self._axis, self._start_memory, known_memory=True)
         return known.budget(np.zeros(1), np.array([y]), np.zeros(1), age)
 
     def _memory_square(self, v: FloatArray) -> FloatArray:

@@ -126,7 +126,9 @@ def judge(number: int, found: dict[str, list[FloatArray]]) -> None:
                 f"{1e9 * np.sqrt(np.mean(spread**2)):.0f})"
             )
     causes = ", ".join(effect.name for effect in axis.effects) or "none"
-    print(f"{number:3} {name:34} {axis.quality.verdict:14} {causes:28} " + " ".join(f"{one:>18}" for one in said), end="")
+    print(
+        f"{number:3} {name:34} {axis.quality.verdict:14} {causes:28} " + " ".join(f"{one:>18}" for one in said), end=""
+    )
     print(f" {time.perf_counter() - began:5.0f} s", flush=True)
 
 

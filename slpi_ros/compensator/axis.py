@@ -499,8 +499,10 @@ class Axis:
             self._uncertainty = self._uncertainty_of = None
             return
         of = self.model, self.confidence.state, self.zero
-        if self._uncertainty is None or self._uncertainty_of is None or any(
-            one is not other for one, other in zip(of, self._uncertainty_of, strict=True)
+        if (
+            self._uncertainty is None
+            or self._uncertainty_of is None
+            or any(one is not other for one, other in zip(of, self._uncertainty_of, strict=True))
         ):
             known = self.confidence.state in (KNOWN, RESTORED)
             self._uncertainty = None

@@ -8,8 +8,8 @@ from datetime import UTC, datetime
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from slpi_ros.arrays.rates import fastest
 from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays.rates import fastest
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError, length
 from slpi_ros.identification.error_statistics import with_statistics
 from slpi_ros.identification.least_squares import Fitted

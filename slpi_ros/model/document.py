@@ -136,7 +136,8 @@ def _axis_from(axis: dict[str, Any]) -> AxisModel:
 
 
 def _quality_from(quality: dict[str, Any]) -> FitQuality:
-    found = FitQuality(*(quality.get(key) for key in QUALITY))
+    given: list[Any] = [quality.get(key) for key in QUALITY]
+    found = FitQuality(*given)
     return replace(found, regions=tuple(found.regions)) if found.regions is not None else found
 
 

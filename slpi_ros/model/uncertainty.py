@@ -5,7 +5,7 @@ docs/explanation/uncertainty.md says what each component assumes, and what is no
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from math import exp, hypot, inf, log, log1p, sqrt
 
@@ -17,8 +17,7 @@ from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.surroundings import Surroundings
 from slpi_ros.errors import ModelError
-from slpi_ros.hysteresis.turning_points import Memory
-from slpi_ros.model.axis_model import RESOLUTION, AxisModel, StartMemory
+from slpi_ros.model.axis_model import ABOVE_NOISE, RESOLUTION, AxisModel, Start, StartMemory
 
 # Equal parts of the displacement range for which a model document holds the error.
 REGIONS = 10
@@ -26,6 +25,9 @@ REGIONS = 10
 COVERAGE_FACTOR = 2.0
 # Standard deviation of a rectangular distribution of width 1.
 RECTANGULAR = 1.0 / sqrt(12.0)
+# An error with a cause that is not in the model is no chance: on another path it may stay at its bound. That of a
+# rectangular distribution is this multiple of its rms.
+SYSTEMATIC = sqrt(3.0)
 # Points of the table over the range, and steps of that of the memory to either end.
 POINTS, STEPS = 200, 32
 # Components of the budget, with what each of them is.
@@ -72,7 +74,7 @@ class Quantity:
     uncertainty: tuple[float, float]
 
     def square(self, value: FloatArray | None, moved: FloatArray) -> FloatArray:
-        """Return the square of the uncertainty (m^2) for values or None, at displacements `moved` (m) from the origin."""
+        """Return the square of the uncertainty (m^2) for values or None, `moved` (m) away from the origin."""
         (zero, sensitivity), (own, of_sensitivity) = self.gains, self.uncertainty
         if value is None:
             return ((zero + sensitivity * moved) * self.spread) ** 2
@@ -92,9 +94,7 @@ class AxisUncertainty:
         Whether this state is known. By default only that after ``wiped``: otherwise the stage may have moved since.
     """
 
-    def __init__(
-        self, axis: AxisModel, start_memory: StartMemory = "end", known_memory: bool | None = None
-    ) -> None:
+    def __init__(self, axis: AxisModel, start_memory: StartMemory = "end", known_memory: bool | None = None) -> None:
         quality = axis.quality
         if quality.regions is None or quality.drift is None or quality.duration is None or quality.fastest is None:
             raise ModelError(
@@ -144,7 +144,10 @@ class AxisUncertainty:
         own = np.interp(at, centres[visited], errors[visited]) ** 2
         variance = (new - own) / 2.0
         noise = quality.floor_rms**2
-        left = np.maximum(new - variance - noise, 0.0) + (RESOLUTION * self.stroke) ** 2
+        left = np.maximum(new - variance - noise, 0.0)
+        if self._systematic:
+            left = left * SYSTEMATIC**2
+        left += (RESOLUTION * self.stroke) ** 2
         # In a region without samples the error of the nearest one grows with the distance in regions.
         distance = np.abs(at[:, None] - centres[visited]).min(axis=1) * REGIONS - 0.5
         apart = np.where(distance > 1e-9, 1.0 + distance, 0.0) ** 2
@@ -152,6 +155,14 @@ class AxisUncertainty:
         # others have been found to have, divided by the share of these.
         uncovered = (1.0 - quality.covered) / max(quality.covered, 1e-2)
         return np.sqrt(variance), np.sqrt(left), np.sqrt((variance + left) * (apart + uncovered))
+
+    @property
+    def _systematic(self) -> bool:
+        """Whether what is left has a cause that is not in the model: by the verdict, else by the noise of the sensor."""
+        quality = self._axis.quality
+        if quality.verdict is None:
+            return max(quality.held_out_rms, quality.rms) > ABOVE_NOISE * quality.floor_rms
+        return quality.verdict in ("unexplained", "partly_named")
 
     @cached_property
     def memory_table(self) -> FloatArray:
@@ -169,7 +180,7 @@ class AxisUncertainty:
             path = np.concatenate([down[: k + 1], up, [low, high]])
             ways = []
             for turns in ([high, v0], [high, low, v0]):
-                memory = Memory(axis.hysteresis, low, 0.0, primed=True)
+                memory = replace(axis, start=Start(low, 0.0, (low,))).memory("start")
                 memory.forward_array(np.array(turns))
                 ways.append(memory.forward_array(path))
             own = axis.memory(self._start_memory).forward_array(path)
@@ -245,7 +256,7 @@ class AxisUncertainty:
         return self.memory_table[lower, upper]
 
     def memory_square(self, lowest: float, highest: float) -> float:
-        """Return the square of the uncertainty (m^2) from the memory once the voltages (V) so far have these extremes."""
+        """Return the square of the uncertainty (m^2) from the memory after voltages with these extremes (V)."""
         if self.known_memory:
             return 0.0
         v0, (down, up) = self.initial_voltage, self._memory_steps
@@ -254,7 +265,9 @@ class AxisUncertainty:
 
     def _relaxing_square(self, since: FloatArray) -> FloatArray:
         """Return the square (m^2) of what still relaxes after the moves before the start, or those of the reset."""
-        return np.asarray(sum((size * np.exp(-since / tau) for tau, size in self.relaxations), np.zeros_like(since))) ** 2
+        return (
+            np.asarray(sum((size * np.exp(-since / tau) for tau, size in self.relaxations), np.zeros_like(since))) ** 2
+        )
 
     def _age_square(self, since: FloatArray, y: FloatArray) -> FloatArray:
         slow = self.drift_square + self.gain_drift_square * (y - self.gain_origin) ** 2

@@ -131,9 +131,8 @@ class StageModel:
         known = {key: _as_array(values, key) for key, values in (surroundings or {}).items()}
         spread = {}
         for name, v in voltage.items():
-            with _naming(name, "uncertainty"):
-                own = AxisUncertainty(self.axes[name], start_memory)
-                spread[name] = own.budget(time, desired[name], v, age, known).combined
+            own = self.uncertainty(name, start_memory)
+            spread[name] = own.budget(time, desired[name], v, age, known).combined
         if isinstance(y, Mapping):
             return voltage, spread
         return next(iter(voltage.values())), next(iter(spread.values()))
@@ -235,6 +234,14 @@ class StageModel:
         Other axes are assumed at rest; `start_memory` is as in `compensate`.
         """
         return self.axis(axis).stream(start_memory=start_memory)
+
+    def uncertainty(self, axis: str, start_memory: StartMemory = "end") -> AxisUncertainty:
+        """Return the uncertainty of one axis: ``budget`` along a path, ``stream`` sample by sample beside `stream`.
+
+        ModelError if the model does not hold what it needs.
+        """
+        with _naming(axis, "uncertainty"):
+            return AxisUncertainty(self.axis(axis), start_memory)
 
     def streams(self, start_memory: StartMemory = "end") -> StageStream:
         """Return a causal compensator of all axes, ``step(t, {axis: y}) -> {axis: v}``, seconds and metres to volts.

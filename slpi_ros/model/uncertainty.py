@@ -158,7 +158,7 @@ class AxisUncertainty:
 
     @property
     def _systematic(self) -> bool:
-        """Whether what is left has a cause that is not in the model: by the verdict, else by the noise of the sensor."""
+        """Whether what is left has a cause that is not in the model: by the verdict, else by the noise."""
         quality = self._axis.quality
         if quality.verdict is None:
             return max(quality.held_out_rms, quality.rms) > ABOVE_NOISE * quality.floor_rms

@@ -458,8 +458,11 @@ def _extended(model: AxisModel, now: Explanation, source: str) -> AxisModel:
 
 
 def _errors(now: Explanation) -> list[tuple[FloatArray, ...]]:
-    """Return times (s), displacements, residuals, and residuals with the drift (m) of each record, used samples."""
-    drift = now.predicted - now.prediction_without("thermal_drift")
+    """Return times (s), displacements, residuals, and residuals with what belongs to each record (m), used samples."""
+    drift = np.zeros_like(now.predicted)
+    for effect in now.effects:
+        if effect.side == "record":
+            drift += now.predicted - now.prediction_without(effect.name)
     parts = []
     for part, rows in zip(now.evidence.parts, now.evidence.slices, strict=True):
         used, left = part.used, now.residual[rows]

@@ -7,15 +7,12 @@ docs/explanation/uncertainty.md says what each component assumes, and what is no
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
-from math import exp, hypot, inf, log, log1p, sqrt
+from math import exp, hypot, inf, log1p, sqrt
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.creep import Creep
-from slpi_ros.effects.gain_drift import GainDrift
-from slpi_ros.effects.rate_dependence import RateDependence
-from slpi_ros.effects.surroundings import Surroundings
+from slpi_ros.effects.base import FollowedGain
 from slpi_ros.errors import ModelError
 from slpi_ros.model.axis_model import ABOVE_NOISE, RESOLUTION, AxisModel, Start, StartMemory
 
@@ -63,25 +60,6 @@ class Budget:
         return COVERAGE_FACTOR * self.combined
 
 
-@dataclass(frozen=True)
-class Quantity:
-    """What the uncertainty needs of a followed quantity: gains in m per unit and 1 per unit, with uncertainties."""
-
-    key: str
-    reference: float
-    spread: float  # standard deviation of a value that is not known, in its unit
-    gains: tuple[float, float]  # m per unit, of the zero; 1 per unit, of the sensitivity
-    uncertainty: tuple[float, float]
-
-    def square(self, value: FloatArray | None, moved: FloatArray) -> FloatArray:
-        """Return the square of the uncertainty (m^2) for values or None, `moved` (m) away from the origin."""
-        (zero, sensitivity), (own, of_sensitivity) = self.gains, self.uncertainty
-        if value is None:
-            return ((zero + sensitivity * moved) * self.spread) ** 2
-        away = value - self.reference
-        return np.asarray((own**2 + (of_sensitivity * moved) ** 2) * away**2)
-
-
 class AxisUncertainty:
     """The uncertainty of one axis; ModelError if the model does not hold what it needs.
 
@@ -111,7 +89,6 @@ class AxisUncertainty:
         self.low, high = axis.displacement_range
         self.stroke = high - self.low
         self.scale = (POINTS - 1) / self.stroke
-        self._origin = axis.start.displacement
         self.fastest = quality.fastest
         self.fit, self.left, self.unvisited = self._by_displacement()
         base = self.fit**2 + self.left**2
@@ -120,12 +97,15 @@ class AxisUncertainty:
         self.most = RECTANGULAR * self.stroke
         self.drift_square = quality.drift**2
         self.duration = quality.duration
-        self.gain_drift_square, self.gain_origin = _gain_drift(axis)
-        self.creep, self.relaxations = _creep(axis, self.stroke)
-        self.quantities = _quantities(axis)
-        self.quantity_origin = next(
-            (effect.origin for effect in axis.effects if isinstance(effect, Surroundings)), self._origin
-        )
+        unsure = [effect.unsure for effect in axis.effects]
+        self.gain_drift_square = sum(one.gain_drift for one in unsure)
+        self.gain_origin = next((one.origin for one in unsure if one.gain_drift), 0.0)
+        # A stage creeps after moves that are anywhere in its range.
+        self.relaxations = [(tau, share * self.most) for one in unsure for tau, share in one.relaxations]
+        slope = self.stroke / (axis.voltage_range[1] - axis.voltage_range[0])
+        self.creep = hypot(*(hypot(one.slow_share * self.most, one.slow_volts * slope) for one in unsure))
+        self.quantities = [quantity for one in unsure for quantity in one.quantities]
+        self.quantity_origin = next((one.origin for one in unsure if one.quantities), 0.0)
 
     def _by_displacement(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return covariance of the fit, what is left, and unvisited regions, (`POINTS`,) each, m, over the range."""
@@ -277,7 +257,7 @@ class AxisUncertainty:
     def _surroundings_square(self, values: Mapping[str, FloatArray], y: FloatArray) -> FloatArray:
         total = np.zeros_like(y)
         for one in self.quantities:
-            total += one.square(values.get(one.key), y - self.quantity_origin)
+            total += _quantity_square(one, values.get(one.followed.key), y - self.quantity_origin)
         return total
 
     def stream(self, age: float = 0.0) -> "StreamingUncertainty":
@@ -343,49 +323,16 @@ class StreamingUncertainty:
         square += (of.creep * log1p(since / of.duration)) ** 2
         square += sum(size * exp(-since / tau) for tau, size in of.relaxations) ** 2
         moved = np.array([y - of.quantity_origin])
-        return square + sum(float(one.square(self._values.get(one.key), moved)[0]) for one in of.quantities)
+        return square + sum(
+            float(_quantity_square(one, self._values.get(one.followed.key), moved)[0]) for one in of.quantities
+        )
 
 
-def _gain_drift(axis: AxisModel) -> tuple[float, float]:
-    """Return the square of the drift of the sensitivity (1/s), as of a random walk, and its origin (m)."""
-    for effect in axis.effects:
-        if isinstance(effect, GainDrift) and effect.times[0] > 0.0:
-            gains, times = np.diff((0.0, *effect.gains)), np.diff((0.0, *effect.times))
-            return float(np.sum(gains**2) / np.sum(times)), effect.origin
-    return 0.0, 0.0
-
-
-def _creep(axis: AxisModel, stroke: float) -> tuple[float, tuple[tuple[float, float], ...]]:
-    """Return the uncertainty (m) of creep slower than the records, for each factor of e in time, and its relaxations.
-
-    The latter are time constants (s) and the standard deviations (m) of what each still has to go at the start.
-    """
-    slow, relaxations = 0.0, list[tuple[float, float]]()
-    for effect in axis.effects:
-        if isinstance(effect, Creep):
-            # The stage creeps after moves that are anywhere in its range.
-            relaxations += [
-                (tau, abs(gain) * RECTANGULAR * stroke)
-                for tau, gain in zip(effect.time_constants, effect.gains, strict=True)
-            ]
-            count, times = len(effect.gains), np.log(effect.time_constants)
-            # A single relaxation stands for a decade.
-            spacing = float(np.ptp(times)) / (count - 1) if count > 1 and np.ptp(times) > 0.0 else log(10.0)
-            slow = hypot(slow, abs(sum(effect.gains)) / (count * spacing) * RECTANGULAR * stroke)
-        elif isinstance(effect, RateDependence):
-            # Its logarithm goes on for ever in the model: true within half of it either way.
-            slope = stroke / (axis.voltage_range[1] - axis.voltage_range[0])
-            slow = hypot(slow, RECTANGULAR * effect.threshold * slope)
-    return slow, tuple(relaxations)
-
-
-def _quantities(axis: AxisModel) -> tuple[Quantity, ...]:
-    found = []
-    for effect in axis.effects:
-        for k, one in enumerate(effect.quantities if isinstance(effect, Surroundings) else ()):
-            spread = RECTANGULAR * (one.highest - one.lowest)
-            gains = one.offset_gain, one.sensitivity_gain
-            names = (f"quantities.{k}.{name}" for name in ("offset_gain", "sensitivity_gain"))
-            own, of_sensitivity = (effect.uncertainty.get(name, 0.0) for name in names)
-            found.append(Quantity(one.key, one.reference, spread, gains, (own, of_sensitivity)))
-    return tuple(found)
+def _quantity_square(one: FollowedGain, value: FloatArray | None, moved: FloatArray) -> FloatArray:
+    """Return the square of the uncertainty (m^2) for values or None, `moved` (m) away from the origin."""
+    (zero, sensitivity), (own, of_sensitivity) = one.gains, one.uncertainty
+    if value is None:
+        # It is anywhere in its recorded range.
+        spread = RECTANGULAR * (one.followed.highest - one.followed.lowest)
+        return np.asarray(((zero + sensitivity * moved) * spread) ** 2)
+    return np.asarray((own**2 + (of_sensitivity * moved) ** 2) * (value - one.followed.reference) ** 2)

@@ -31,6 +31,7 @@ import slpi_ros
 from slpi_ros.errors import SlpiError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.io.record import Record
+from slpi_ros.model.axis_model import StartMemory
 from slpi_ros.model.limits import Limits, decaying_turns
 from slpi_ros.model.uncertainty import COVERAGE_FACTOR, AxisUncertainty
 from slpi_ros.simulation import character
@@ -43,6 +44,8 @@ Plant = Callable[[FloatArray, FloatArray], FloatArray]
 
 RATE, RECORDED = 500.0, 30.0
 HORIZONS = {"1 s": 1.0, "1 min": 60.0, "1 h": 3600.0}
+# Initial state that the model assumes, and what was done to the stage before.
+STARTS: dict[StartMemory, str] = {"wiped": "reset", "end": "moved"}
 # Duration of the judged path at each horizon, and of a leg of it, s; range of its ends, shares of the range.
 JUDGED, LEGS, INNER = 4.0, (0.2, 1.0), (0.05, 0.95)
 # Reset, and moves that the model does not know of: duration (s) of each turn.
@@ -103,7 +106,7 @@ def judge(number: int, found: dict[str, list[FloatArray]]) -> None:
     axis = model.axes["x"]
     (low, high), limits = axis.displacement_range, Limits(*axis.voltage_range)
     said = []
-    for memory in ("wiped", "end"):
+    for memory in STARTS:
         if memory == "wiped":
             before = moves([float(v[-1]), *decaying_turns(limits, 0.0, CYCLES)], [TURN] * (2 * CYCLES + 2))
         else:
@@ -119,7 +122,7 @@ def judge(number: int, found: dict[str, list[FloatArray]]) -> None:
         ratio = np.abs(reached - desired) / u
         for place, horizon in enumerate(HORIZONS, 1):
             own = ratio[at == place]
-            found[f"{memory} {horizon}"].append(own)
+            found[f"{STARTS[memory]} {horizon}"].append(own)
             error, spread = (reached - desired)[at == place], u[at == place]
             said.append(
                 f"{np.mean(own <= COVERAGE_FACTOR):5.0%} ({1e9 * np.sqrt(np.mean(error**2)):.0f}/"
@@ -184,7 +187,7 @@ def main() -> int:
     parser.add_argument("--without-measured", action="store_true", help="simulated stages only")
     options = parser.parse_args()
     found: dict[str, list[FloatArray]] = defaultdict(list)
-    columns = [f"{memory} {horizon}" for memory in ("reset", "moved") for horizon in HORIZONS]
+    columns = [f"{start} {horizon}" for start in STARTS.values() for horizon in HORIZONS]
     print(f"share within 2 u (rms error / rms u, nm)\n{'':82}" + " ".join(f"{one:>18}" for one in columns))
     for number in range(options.first, options.first + options.stages):
         judge(number, found)
@@ -193,7 +196,10 @@ def main() -> int:
         measured(found)
     print(f"\n{'':16}{'all samples':>12}{'stages within':>15}")
     simulated = [each for name, those in found.items() if name != "measured" for each in those]
-    rows = dict(found) | ({"simulated": simulated} if simulated else {})
+    rows = dict(found)
+    for horizon in HORIZONS if simulated else ():
+        rows[f"all {horizon}"] = [each for start in STARTS.values() for each in found[f"{start} {horizon}"]]
+    rows |= {"simulated": simulated} if simulated else {}
     for name, those in rows.items():
         share = float(np.mean(np.concatenate(those) <= COVERAGE_FACTOR))
         within = sum(np.mean(one <= COVERAGE_FACTOR) >= LOWEST for one in those)

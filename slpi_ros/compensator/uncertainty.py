@@ -25,7 +25,13 @@ class UncertaintyWatch:
         self._streaming = AxisUncertainty(replace(model, end=here), "end", known).stream(age)
         self._streaming.surround(surroundings)
         self._t = self._waited = 0.0
-        self.present = self._streaming.step(0.0, stream.uncoupled_displacement + stream.coupled, stream.voltage)
+        self._streaming.note(0.0, stream.uncoupled_displacement + stream.coupled, stream.voltage)
+        self._note = self._streaming.note
+
+    @property
+    def present(self) -> float:
+        """Standard uncertainty of where the axis is now, metres."""
+        return self._streaming.present
 
     def surround(self, key: str, value: float) -> None:
         """Take a value of a quantity that the stage follows."""
@@ -33,14 +39,14 @@ class UncertaintyWatch:
 
     def sample(self, dt: float, y: float, v: float) -> None:
         """Follow a displacement (m) and its voltage (V), `dt` (s) after the last sample."""
-        self._t += dt if dt > self._waited else 0.0
-        self._t -= self._waited if dt > self._waited else 0.0
-        self._waited = 0.0
-        self.present = self._streaming.step(self._t, y, v)
+        if self._waited:
+            dt, self._waited = max(dt - self._waited, 0.0), 0.0
+        self._t += dt
+        self._note(self._t, y, v)
 
     def wait(self, dt: float, y: float, v: float) -> None:
         """Let the age count on: the last sample, of a displacement (m) and its voltage (V), was `dt` (s) ago."""
         if dt - self._waited > IDLE:
             self._t += dt - self._waited
             self._waited = dt
-            self.present = self._streaming.step(self._t, y, v)
+            self._note(self._t, y, v)

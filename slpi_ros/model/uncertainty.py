@@ -279,7 +279,9 @@ class StreamingUncertainty:
         self._known = of.known_memory
         self._memory = 0.0
         self._extremes = of.initial_voltage, of.initial_voltage
-        self._t = self._v = self._since = 0.0
+        self._since = 0.0
+        # Time (s), displacement (m) and voltage (V) of the last two samples.
+        self._before = self._last = (0.0, 0.0, 0.0)
         # No voltage is within these, so that the first sample begins the range.
         self._lowest, self._highest = inf, -inf
 
@@ -292,17 +294,26 @@ class StreamingUncertainty:
         """Note values of quantities that the stage follows, by name, in their units."""
         self._values.update({key: np.array([value]) for key, value in values.items()})
 
-    def step(self, t: float, y: float, v: float) -> float:
-        """Return the standard uncertainty (m) of the displacement `y` (m) for the voltage `v` (V) at time `t` (s)."""
+    def note(self, t: float, y: float, v: float) -> None:
+        """Follow a sample: time (s), displacement (m) and its voltage (V)."""
         if not self._lowest <= v <= self._highest:
             self._reach(t, v)
+        self._before, self._last = self._last, (t, y, v)
+
+    def step(self, t: float, y: float, v: float) -> float:
+        """Return the standard uncertainty (m) of the displacement `y` (m) for the voltage `v` (V) at time `t` (s)."""
+        self.note(t, y, v)
+        return self.present
+
+    @property
+    def present(self) -> float:
+        """Standard uncertainty of the last displacement, metres."""
+        (before, _, v_before), (t, y, v) = self._before, self._last
         place = int((y - self._low) * self._scale)
         square = within = self._within[0 if place < 0 else place if place < POINTS else POINTS - 1]
-        dt, dv = t - self._t, v - self._v
-        most = self._fastest * dt
-        if (dv > most or -dv > most) and dt > 0.0:
-            square += min(within * (abs(dv) / dt / self._fastest - 1.0) ** 2, self._of.most**2)
-        self._t, self._v = t, v
+        dt, dv = t - before, abs(v - v_before)
+        if dv > self._fastest * dt and dt > 0.0:
+            square += min(within * (dv / dt / self._fastest - 1.0) ** 2, self._of.most**2)
         since = self._age + (t - self._since)
         if self._more:
             square += self._others(since, y)
@@ -311,7 +322,7 @@ class StreamingUncertainty:
     def _reach(self, t: float, v: float) -> None:
         """Note a voltage (V) beyond those so far, at time `t` (s)."""
         if self._lowest > self._highest:
-            self._t, self._v, self._since = t, v, t
+            self._last, self._since = (t, 0.0, v), t
             self._lowest, self._highest = self._extremes
         self._lowest, self._highest = min(v, self._lowest), max(v, self._highest)
         self._memory = 0.0 if self._known else self._of.memory_square(self._lowest, self._highest)

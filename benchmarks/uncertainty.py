@@ -130,7 +130,8 @@ def judge(number: int, found: dict[str, list[FloatArray]]) -> None:
             )
     causes = ", ".join(effect.name for effect in axis.effects) or "none"
     print(
-        f"{number:3} {name:34} {axis.quality.verdict:14} {causes:28} " + " ".join(f"{one:>18}" for one in said), end=""
+        f"{number:3} {name:34} {diagnosis.axes['x'].verdict:14} {causes:28} " + " ".join(f"{one:>18}" for one in said),
+        end="",
     )
     print(f" {time.perf_counter() - began:5.0f} s", flush=True)
 

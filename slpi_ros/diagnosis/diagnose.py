@@ -187,6 +187,8 @@ def _diagnose_axis(
     outcomes = _outcomes(runs, extension.runs, selection.now)
     noise, repeats, alike = selection.now.noise, _repeatability(selection.now), driven_alike(records, axis)
     found = judged(selection, noise, repeats, before, given, outcomes, alike)
+    if extension.model is model:
+        return found, model
     diagnosed = replace(extension.model.quality, verdict=found.verdict)
     return found, replace(extension.model, quality=diagnosed)
 

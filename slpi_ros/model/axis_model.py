@@ -69,7 +69,7 @@ class FitQuality:
     drift: float | None = None  # m per square root of a second, of the zero
     duration: float | None = None  # s, of the longest record
     left_out_rms: float | None = None  # m, of records that were not fitted; None: there was only one
-    verdict: str | None = None  # of the diagnosis; None: not diagnosed
+    verdict: str | None = None  # of the diagnosis that extended it; None: none did
 
     @property
     def sources(self) -> list[str]:

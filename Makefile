@@ -40,7 +40,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test test-long test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-agreement bench-confusion bench-driver bench-surroundings bench-learning bench-export test-export-arm FORCE
+.PHONY: help build test test-long test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-agreement bench-confusion bench-driver bench-surroundings bench-learning bench-export bench-coverage test-export-arm FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -80,6 +80,7 @@ help:
 	@echo 'make bench-confusion   effects, pairs, clean stages and causes that no effect describes: wrong or silent; an hour'
 	@echo 'make bench-calibrator  the calibrator on 20 hidden stages, and 30 faults; an hour'
 	@echo 'make bench-promise     the error that the calibrator promises on 20 stages, and that of scans later; half an hour'
+	@echo 'make bench-coverage   true errors within two standard uncertainties, by horizon; COVERAGE="--stages 100"; 20 minutes'
 	@echo 'make bench-fleet    300 bags of 30 stages on Dask: changes found, one worker beside two, 20 minutes'
 	@echo 'make bench-export   the exported C inverse beside the stream of Python: agreement, time, memory; a few minutes'
 	@echo 'make test-export-arm  the exported C inverse on simulated Cortex-M4F and M7; as root it installs the tools (apt, 1 GB)'
@@ -220,6 +221,9 @@ bench-confusion: build
 
 bench-promise: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/promise.py
+
+bench-coverage: build
+	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/uncertainty.py $(COVERAGE)
 
 bench-fleet: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/fleet.py

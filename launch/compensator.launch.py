@@ -22,6 +22,7 @@ TOPICS = {
     "voltage_topic": ("voltage_command", "topic of the voltage commands"),
     "state_topic": ("stage_state", "topic of the stage state: where the amplifier is"),
     "error_topic": ("tracking_error", "topic of the tracking errors"),
+    "uncertainty_topic": ("displacement_uncertainty", "topic of where the axes are and how uncertain that is"),
     "model_topic": ("stage_model", "topic of the stage model"),
     "diagnostics_topic": ("/diagnostics", "topic of the diagnostics"),
     "voltage_trajectory_topic": ("voltage_trajectory", "topic of whole paths, with trajectory_output: block"),

@@ -22,6 +22,7 @@ TOPICS = {
     "measured_topic": ("measured_displacement", "topic of the measured displacements; stage_state for feedback"),
     "voltage_topic": ("voltage_command", "topic of the voltage commands"),
     "error_topic": ("tracking_error", "topic of the tracking errors"),
+    "uncertainty_topic": ("displacement_uncertainty", "topic of where the axes are and how uncertain that is"),
     "state_topic": ("stage_state", "topic of the stage state"),
     "model_topic": ("stage_model", "topic of the stage model"),
     "diagnostics_topic": ("/diagnostics", "topic of the diagnostics"),

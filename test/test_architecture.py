@@ -200,6 +200,8 @@ NAMED_ELSEWHERE = {
     "identification/record_quality.py": ({"creep", "delay", "lag"}, "what a drive lacks, in words"),
     "diagnosis/tracking.py": ({"delay"}, "a part of a tracking error"),
     "reports/verification.py": ({"delay"}, "the same, in words"),
+    "model/uncertainty.py": ({"surroundings"}, "a component of the budget"),
+    "reports/certificate.py": ({"surroundings"}, "the quantities of a record, in the document"),
     "nodes/compensator.py": ({"surroundings"}, "the same"),
     "nodes/compensator_parameters.py": ({"surroundings"}, "the same"),
     "export/stage.py": ({"surroundings"}, "its quantities come into the exported source by a call of their own"),

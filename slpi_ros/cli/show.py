@@ -13,15 +13,21 @@ def _add_options(command: ArgumentParser) -> None:
 def _run(options: Namespace) -> Result:
     from slpi_ros.model.document import format_model, load_model
     from slpi_ros.reports.text import describe_model, model_limits, verdict
+    from slpi_ros.reports.uncertainty import describe_uncertainty
 
     model = load_model(options.model)
     limits, own = model_limits(model), shlex.quote(options.model)
+
+    def uncertain(*, details: bool) -> list[str]:
+        axes = model.axes.items()
+        return [f"axis {name}: {line}" for name, axis in axes for line in describe_uncertainty(axis, details=details)]
+
     return Result(
-        describe_model(model, details=False),
+        [*describe_model(model, details=False), *uncertain(details=False)],
         format_model(model),
         f"slpi diagnose BAG... --model {own} -o diagnosis" if limits else f"slpi verify OTHER_BAG --model {own}",
         verdict(limits),
-        describe_model(model),
+        [*describe_model(model), *uncertain(details=True)],
     )
 
 

@@ -26,6 +26,11 @@ def _add_options(command: ArgumentParser) -> None:
         "--without-offset", action="store_true",
         help="the tolerance holds for the error without its constant part; default: for the absolute error",
     )  # fmt: skip
+    command.add_argument(
+        "--certificate", action="store_true",
+        help="also write certificate.json and certificate.html into the folder of -o: stage, records with their "
+        "SHA-256, method, range, errors, budget of uncertainty, conditions, versions, verdict",
+    )  # fmt: skip
     common.add_output(command, "DIR", "folder of verification.json and report.html; default: none", required=False)
     command.add_argument(
         "--desired-topic", metavar="TOPIC",
@@ -48,6 +53,7 @@ def _run(options: Namespace) -> Result:
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.io.schemas import format_document
     from slpi_ros.model.document import load_model
+    from slpi_ros.reports import certificate as certificates
     from slpi_ros.reports.text import verdict
     from slpi_ros.reports.verification import (
         FILES,
@@ -65,23 +71,30 @@ def _run(options: Namespace) -> Result:
             raise UsageError(f"--tolerance {options.tolerance:g}: give a positive number of micrometres")
         tolerance = 1e-6 * options.tolerance
     model = common.with_sensor(load_model(options.model), options)
+    if options.certificate and options.output is None:
+        raise UsageError("--certificate: give the folder that it is written into, -o DIR")
+    names = (*FILES, *certificates.FILES) if options.certificate else FILES
     if options.output is not None:
-        common.allow_folder(options, options.output, *FILES, inputs=[options.model])
+        common.allow_folder(options, options.output, *names, inputs=[options.model])
     # Those of the calibrator are named by their place beside the model.
     places = Path(), Path(options.model).parent
     known = {(at / bag).resolve() for axis in model.axes.values() for bag in axis.quality.sources for at in places}
+    fitted = [bag for bag in options.bags if Path(bag).resolve() in known]
     own = [
         f"{bag}: the model was identified from this bag; an error on it proves nothing, record another one"
-        for bag in options.bags
-        if Path(bag).resolve() in known
+        for bag in fitted
     ]
-    with nullcontext() if options.output is None else output_folder(options.output, *FILES) as folder:
+    with nullcontext() if options.output is None else output_folder(options.output, *names) as folder:
         request = VerifyRequest(
             source, model, tolerance, options.desired_topic, options.without_offset, options.start_memory
         )
-        found = verify(request).verification
+        done = verify(request)
+        found = done.verification
         if folder:
             write_files(folder, found)
+        if folder and options.certificate:
+            of = certificates.Verified(found, done.records, options.bags, model, options.model, fitted)
+            certificates.write_files(folder, certificates.certificate(of))
     if found.passed:
         next_command = f"slpi compensate {shlex.quote(options.model)} DESIRED.csv -o VOLTAGE.csv"
     else:

@@ -14,6 +14,7 @@ from slpi_ros.compensator.persistence import KNOWN, RESETTING, RESTORED, MemoryC
 from slpi_ros.compensator.ramps import Brake, Ramp
 from slpi_ros.compensator.sensor_watch import Fault, SensorWatch
 from slpi_ros.compensator.statistics import TrackingStatistics
+from slpi_ros.compensator.uncertainty import UncertaintyWatch
 from slpi_ros.compensator.validation import Stamps, implausible
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS
@@ -85,6 +86,9 @@ class Axis:
         self._setpoint: Sensed | None = None
         self._expected: Sensed | None = None
         self.surroundings: dict[str, float] = {}  # values of quantities in use
+        # Uncertainty of where the axis is, while somebody asks for it, and the model, memory and zero that it is of.
+        self._uncertainty: UncertaintyWatch | None = None
+        self._uncertainty_of: tuple[AxisModel | None, str, Zero] | None = None
 
     # State
 
@@ -183,6 +187,8 @@ class Axis:
         self.surroundings[key] = value
         for stream in self._streams:
             stream.surround({key: value})
+        if self._uncertainty:
+            self._uncertainty.surround(key, value)
 
     @property
     def _streams(self) -> tuple[StreamingInverse, ...]:
@@ -288,6 +294,8 @@ class Axis:
             self.held = self.slewing = False
         self.given_ns = now_ns
         self.start_memory, self._replaced = None, False
+        if self._uncertainty is not None:
+            self._uncertainty.sample(dt, y, v)
         self.amplifier.output(v, now_ns)
         if self._setpoint:
             self._setpoint.hold(y, now_ns)
@@ -347,6 +355,8 @@ class Axis:
                 v = self._correct(dt, self.stream.desired if desired is None else desired, v, now_ns)
             self.slewing = self.stream.missed and not self.stream.held
             self.held = self.stream.held
+            if self._uncertainty is not None:
+                self._uncertainty.sample(dt, self.expected, v)
             self.amplifier.output(v, now_ns)
         self.due_ns = now_ns + self._period_ns
         if not (self.slewing or self.in_motion):
@@ -473,6 +483,34 @@ class Axis:
                 self._close_loop()
             self.confidence = MemoryConfidence(doubt=f"chosen by measurement: start_memory '{best}', not '{assumed}'")
 
+    @property
+    def expected(self) -> float:
+        """Where the axis is according to the model, metres."""
+        own = self._applied if self._feedback else self.stream
+        return own.uncoupled_displacement + self.stream.coupled
+
+    @property
+    def uncertainty(self) -> float | None:
+        """Standard uncertainty of `expected`, metres, by the model alone; None if nobody asks for it."""
+        return self._uncertainty.present if self._uncertainty else None
+
+    def watch_uncertainty(self, wanted: bool, age: float, now_ns: int) -> None:
+        """Follow the uncertainty, or no longer; `age` (s) is that of the zero. ModelError if it is not known."""
+        if not wanted or self.model is None:
+            self._uncertainty = self._uncertainty_of = None
+            return
+        of = self.model, self.confidence.state, self.zero
+        if (
+            self._uncertainty is None
+            or self._uncertainty_of is None
+            or any(one is not other for one, other in zip(of, self._uncertainty_of, strict=True))
+        ):
+            known = self.confidence.state in (KNOWN, RESTORED)
+            self._uncertainty = None
+            self._uncertainty = UncertaintyWatch(self.model, self.stream, known, age, self.surroundings)
+            self._uncertainty_of = of
+        self._uncertainty.wait((now_ns - self.given_ns) * 1e-9, self.expected, self.voltage)
+
     def watch_sensor(self, fault_time: float, now_ns: int) -> Fault | None:
         """Switch the feedback off if its sensor has been faulty for `fault_time` (s); return a new fault."""
         feedback = self._feedback
@@ -582,6 +620,8 @@ class Axis:
         stream.drive(v, dt)
         if self._feedback:
             self._expect(self._applied.drive(v, dt), now_ns)
+        if self._uncertainty is not None:
+            self._uncertainty.sample(dt, self.expected, v)
         self.amplifier.output(v, now_ns)
         self.due_ns = now_ns + self._period_ns
 

@@ -3,6 +3,7 @@
 from array import array
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from enum import Enum
 
 from numpy.typing import ArrayLike
@@ -354,6 +355,19 @@ class Controller:
         """Switch off the feedback of axes whose sensor is faulty for `fault_time` (s); return the new faults."""
         found = [(axis, axis.watch_sensor(fault_time, now_ns)) for axis in self.axes] if self.ownership.owned else []
         return [(axis, fault) for axis, fault in found if fault]
+
+    def watch_uncertainty(self, wanted: bool, now: datetime, now_ns: int) -> str:
+        """Follow the uncertainty of all axes, or no longer; return why that is not possible, else "".
+
+        `now` is the present in UTC: the age counts from when a zero was set, or the model was made, as far as known.
+        """
+        for axis in self.axes:
+            since = axis.zero.at or (self.model.created if self.model else "")
+            try:
+                axis.watch_uncertainty(wanted and self.model is not None, _seconds(since, now), now_ns)
+            except SlpiError as error:
+                return f"axis '{axis.name}': {error}"
+        return ""
 
     def _axes_of(self, names: Sequence[str], count: int, now_ns: int) -> list[Axis]:
         """Return the named axes; RejectedError unless they can accept `count` desired displacements now."""
@@ -775,3 +789,12 @@ class Controller:
         self._stage = StageStream(streams, coupling, self.model.origins) if coupling.on else None
         for axis in self.axes:
             self.voltages[axis.place] = axis.voltage
+
+
+def _seconds(since: str, now: datetime) -> float:
+    """Return the time (s) from an ISO 8601 time to `now`; 0 if it is none, or to come."""
+    try:
+        then = datetime.fromisoformat(since)
+    except ValueError:
+        return 0.0
+    return max((now - (then if then.tzinfo else then.replace(tzinfo=UTC))).total_seconds(), 0.0)

@@ -19,6 +19,7 @@ from slpi_ros.diagnosis.significance import NO_WORSE, counts
 from slpi_ros.effects.registry import EFFECTS, in_order
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
+from slpi_ros.identification.error_statistics import with_statistics
 from slpi_ros.identification.free_run import FreeRun, free_run, likely_starts, rms_of
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.refit import require_own
@@ -189,7 +190,10 @@ def _diagnose_axis(
     outcomes = _outcomes(runs, extension.runs, selection.now)
     noise, repeats, alike = selection.now.noise, _repeatability(selection.now), driven_alike(records, axis)
     found = judged(selection, noise, repeats, before, given, outcomes, alike)
-    return found, extension.model
+    if extension.model is model:
+        return found, model
+    diagnosed = replace(extension.model.quality, verdict=found.verdict)
+    return found, replace(extension.model, quality=diagnosed)
 
 
 class _Extension(NamedTuple):
@@ -451,6 +455,21 @@ def _extended(model: AxisModel, now: Explanation, source: str) -> AxisModel:
             samples=y.size,
             source=source,
             fastest=max(fastest(part.t[part.used], part.v[part.used]) for part in evidence.parts),
+            left_out_rms=now.held_out.rms_of_records if np.isfinite(now.held_out.records).any() else None,
         ),
     )
-    return replace(extended, end=extended.at_rest(now.u, float(evidence.v[-1])))
+    quality = with_statistics(extended.quality, _errors(now), extended.displacement_range)
+    return replace(extended, quality=quality, end=extended.at_rest(now.u, float(evidence.v[-1])))
+
+
+def _errors(now: Explanation) -> list[tuple[FloatArray, ...]]:
+    """Return times (s), displacements, residuals, and residuals with what belongs to each record (m), used samples."""
+    drift = np.zeros_like(now.predicted)
+    for effect in now.effects:
+        if effect.side == "record":
+            drift += now.predicted - now.prediction_without(effect.name)
+    parts = []
+    for part, rows in zip(now.evidence.parts, now.evidence.slices, strict=True):
+        used, left = part.used, now.residual[rows]
+        parts.append(tuple(x[used] for x in (part.t, part.y, left, left + drift[rows])))
+    return parts

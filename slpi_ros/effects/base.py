@@ -98,6 +98,29 @@ class Followed(NamedTuple):
     highest: float
 
 
+class FollowedGain(NamedTuple):
+    """By how much a stage follows a quantity: of zero (m per unit) and sensitivity (1 per unit), with uncertainties."""
+
+    followed: Followed
+    gains: tuple[float, float]
+    uncertainty: tuple[float, float]
+
+
+class Unsure(NamedTuple):
+    """What an effect leaves unsure in use, after the records that it was fitted to."""
+
+    # Time constants (s), and shares of a motion that each still has to go: in use they begin in an unknown state.
+    relaxations: tuple[tuple[float, float], ...] = ()
+    # Standard uncertainty of what goes on for each factor of e in time beyond the records: share of a motion, and V.
+    slow_share: float = 0.0
+    slow_volts: float = 0.0
+    # Mean square relative change of the sensitivity in a second, as of a random walk.
+    gain_drift: float = 0.0
+    quantities: tuple[FollowedGain, ...] = ()
+    # Displacement (m) that does not change with the sensitivity.
+    origin: float = 0.0
+
+
 Effected = TypeVar("Effected")
 
 
@@ -363,6 +386,11 @@ class EffectBase(Protocol):
     def settling_time(self) -> float:
         """Time (s) after which the piezo has the voltage of the command."""
         return abs(self.shift)
+
+    @property
+    def unsure(self) -> Unsure:
+        """What is unsure of it in use; of most effects nothing besides the error of the model."""
+        return Unsure()
 
     @property
     def followed(self) -> "tuple[Followed, ...]":

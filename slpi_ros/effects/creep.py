@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
-from math import inf
+from math import inf, log
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,6 +17,7 @@ from slpi_ros.effects.base import (
     Side,
     Signal,
     StreamingBase,
+    Unsure,
     by_record,
     longest,
     usual_step,
@@ -93,6 +94,16 @@ class Creep(EffectBase):
             ("gains", sum(min(g, 0.0) for g in self.gains) > -0.9, "more than -0.9 in sum where they are negative"),
             ("gains", sum(self.gains) <= 10, "at most 10 in sum"),
         )
+
+    @property
+    def unsure(self) -> Unsure:
+        """What relaxes at the start, and creep that is slower than the records."""
+        count, times = len(self.gains), [log(each) for each in self.time_constants]
+        spacing = (max(times) - min(times)) / max(count - 1, 1)
+        # A single relaxation stands for a decade. What is slower is in no record, so that all of it is unsure.
+        slow = abs(sum(self.gains)) / (count * (spacing or log(10.0)))
+        sizes = (abs(gain) for gain in self.gains)
+        return Unsure(relaxations=tuple(zip(self.time_constants, sizes, strict=True)), slow_share=slow)
 
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:

@@ -18,6 +18,7 @@ from slpi_ros.effects.base import (
     Side,
     Signal,
     StreamingBase,
+    Unsure,
     is_course,
 )
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining, safe_duration
@@ -95,6 +96,14 @@ class GainDrift(EffectBase):
         if self.times[0] == 0.0:
             return np.full(t.shape, 1.0 + self.gains[-1])
         return 1.0 + np.interp(t, (0.0, *self.times), (0.0, *self.gains))
+
+    @property
+    def unsure(self) -> Unsure:
+        """How fast the sensitivity went on changing in the record."""
+        if self.times[0] == 0.0:
+            return Unsure()
+        steps = np.diff((0.0, *self.gains))
+        return Unsure(gain_drift=float(steps @ steps) / self.times[-1], origin=self.origin)
 
     @property
     def lasting(self) -> "GainDrift":

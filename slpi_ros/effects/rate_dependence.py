@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
-from math import copysign, exp
+from math import copysign, exp, sqrt
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -20,6 +20,7 @@ from slpi_ros.effects.base import (
     Signal,
     StreamingBase,
     TimeShift,
+    Unsure,
 )
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining, safe_duration
@@ -103,6 +104,11 @@ class RateDependence(EffectBase):
         fit=Fit("relative", start=True),
     )  # fmt: skip
     uncertainty: Mapping[str, float] = field(default_factory=dict)
+
+    @property
+    def unsure(self) -> Unsure:
+        """The creep of the law, which goes on for ever: beyond the records it is true within half of it either way."""
+        return Unsure(slow_volts=self.threshold / sqrt(12.0))
 
     @classmethod
     def companion(cls) -> Delay:

@@ -15,10 +15,12 @@ from slpi_ros.effects.base import (
     EffectContext,
     FitContext,
     Followed,
+    FollowedGain,
     ResidualContext,
     Side,
     Signal,
     StreamingBase,
+    Unsure,
     longest,
 )
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining, safe_duration
@@ -123,6 +125,16 @@ class Surroundings(EffectBase):
             ("quantities", ranges, "with a lowest value up to the highest"),
             ("quantities", all(0 < len(key) <= 400 and key.isprintable() for key in keys), "with printable topics"),
         )
+
+    @property
+    def unsure(self) -> Unsure:
+        """The gains of the quantities, with their uncertainties."""
+        found = []
+        for k, (one, followed) in enumerate(zip(self.quantities, self.followed, strict=True)):
+            names = (f"quantities.{k}.{name}" for name in ("offset_gain", "sensitivity_gain"))
+            zero, sensitivity = (self.uncertainty.get(name, 0.0) for name in names)
+            found.append(FollowedGain(followed, (one.offset_gain, one.sensitivity_gain), (zero, sensitivity)))
+        return Unsure(quantities=tuple(found), origin=self.origin)
 
     @property
     def followed(self) -> tuple[Followed, ...]:

@@ -8,8 +8,10 @@ from datetime import UTC, datetime
 import numpy as np
 from threadpoolctl import threadpool_limits
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.arrays.rates import fastest
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError, length
+from slpi_ros.identification.error_statistics import with_statistics
 from slpi_ros.identification.least_squares import Fitted
 from slpi_ros.identification.linear_kinds import FIT_SAMPLES, fit_family, fit_multi_slope, fit_plays
 from slpi_ros.identification.progress import report_progress
@@ -90,10 +92,11 @@ def identify(
         report_progress(f"axis {axis}: identification")
         selected = [select_thinned(part, axis, start, stop, FIT_SAMPLES) for part in records]
         samples = [part for part, _ in selected]
-        rates = []
+        rates, times = [], []
         for part, (one, at) in zip(records, selected, strict=True):
-            stamps = part.time_ns[at[one.fitted]]
-            rates.append(fastest((stamps - stamps[0]) * 1e-9, one.v[one.fitted]))
+            stamps = part.time_ns[at]
+            times.append((stamps - stamps[0]) * 1e-9)
+            rates.append(fastest(times[-1][one.fitted], one.v[one.fitted]))
             release(part.time_ns)
         try:
             # The matrices are small: one thread is fastest.
@@ -116,8 +119,8 @@ def identify(
                     if stop is not None:
                         whole, _ = select_thinned(records[last], axis, None, None, FIT_SAMPLES)
                     model = replace(model, end=replace(model, start=fitted.starts[last]).after(whole.v))
-                quality = replace(model.quality, fastest=max(rates))
-                models[axis] = replace(model, sensor=sensor, quality=quality)
+                quality = _with_statistics(model, fitted.starts, times, samples)
+                models[axis] = replace(model, sensor=sensor, quality=replace(quality, fastest=max(rates)))
         except SlpiError as error:
             raise type(error)(f"{source}: axis '{axis}': {error}") from None
     return StageModel(models, hardware_id, datetime.now(UTC).isoformat(timespec="seconds"))
@@ -130,6 +133,17 @@ def _without_bad_readings(samples: Sequence[Samples], model: AxisModel, starts: 
         path = replace(model, start=start).memory("start").forward_array(part.v)
         good.append(part.without_mixed(path).without_outliers(path))
     return good
+
+
+def _with_statistics(
+    model: AxisModel, starts: Sequence[Start], times: Sequence[FloatArray], samples: Sequence[Samples]
+) -> FitQuality:
+    """Return the quality with what the uncertainty needs, from the free run on each record at its `times` (s)."""
+    parts = []
+    for part, t, start in zip(samples, times, starts, strict=True):
+        error = part.y - replace(model, start=start).hysteresis_only.simulate(t, part.v)
+        parts.append((t[part.fitted], part.y[part.fitted], error[part.fitted]))
+    return with_statistics(model.quality, parts, model.displacement_range)
 
 
 def fit_of(kind: str, *, loops_at_rest: bool) -> Callable[[Sequence[Samples]], Fitted]:

@@ -64,6 +64,12 @@ class FitQuality:
     covered: float  # 0..1, of the cells of the Everett function
     source: str
     fastest: float | None = None  # V/s, see `slpi_ros.model.coverage`; None: unknown, as in older documents
+    # What the uncertainty needs, see `slpi_ros.model.uncertainty`; None: unknown, as in older documents.
+    regions: tuple[float | None, ...] | None = None  # m, rms in equal parts of the displacement range; None: no samples
+    drift: float | None = None  # m per square root of a second, of the zero
+    duration: float | None = None  # s, of the longest record
+    left_out_rms: float | None = None  # m, of records that were not fitted; None: there was only one
+    verdict: str | None = None  # of the diagnosis that extended it; None: none did
 
     @property
     def sources(self) -> list[str]:

@@ -3,7 +3,7 @@
 import json
 import os
 import textwrap
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from math import isfinite
 from typing import Any
 
@@ -18,8 +18,11 @@ from slpi_ros.model.sensor import Sensor
 from slpi_ros.model.stage_model import StageModel
 
 SCHEMA, EARLIER = "slpi_ros/model/2", "slpi_ros/model/1"
-# Names of the fields of `FitQuality`, in order; the last one is optional.
-QUALITY = ("rms_m", "maximum_m", "held_out_rms_m", "floor_rms_m", "samples", "covered", "source", "fastest_V_per_s")
+# Names of the fields of `FitQuality`, in order; those from the fastest rate on are optional.
+QUALITY = (
+    "rms_m", "maximum_m", "held_out_rms_m", "floor_rms_m", "samples", "covered", "source", "fastest_V_per_s",
+    "regions_m", "drift_m_per_root_s", "duration_s", "left_out_rms_m", "verdict",
+)  # fmt: skip
 
 
 def load_model(path: str | os.PathLike[str]) -> StageModel:
@@ -126,10 +129,16 @@ def _axis_from(axis: dict[str, Any]) -> AxisModel:
         end=_start_from(axis["end"]) if "end" in axis else None,
         voltage_range=ranges["voltage_range_V"],
         displacement_range=ranges["displacement_range_m"],
-        quality=FitQuality(*(axis["quality"].get(key) for key in QUALITY)),
+        quality=_quality_from(axis["quality"]),
         effects=tuple(map(registry.from_document, axis.get("effects", []))),
         sensor=Sensor(**axis.get("sensor", {})),
     )
+
+
+def _quality_from(quality: dict[str, Any]) -> FitQuality:
+    given: list[Any] = [quality.get(key) for key in QUALITY]
+    found = FitQuality(*given)
+    return replace(found, regions=tuple(found.regions)) if found.regions is not None else found
 
 
 def _start_from(start: dict[str, Any]) -> Start:
@@ -144,6 +153,8 @@ def _start_document(start: Start) -> dict[str, Any]:
 
 def _axis_document(axis: AxisModel) -> dict[str, Any]:
     quality = dict(zip(QUALITY, asdict(axis.quality).values(), strict=True))
+    if axis.quality.regions is not None:
+        quality["regions_m"] = list(axis.quality.regions)
     return {
         "kind": axis.kind,
         "voltage_range_V": list(axis.voltage_range),

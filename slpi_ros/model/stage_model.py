@@ -19,6 +19,7 @@ from slpi_ros.model.coupling import Coupling
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.sensor import Sensor, corrected
 from slpi_ros.model.streaming import StageStream, StreamingInverse
+from slpi_ros.model.uncertainty import AxisUncertainty
 
 Signal = ArrayLike | Mapping[str, ArrayLike]
 
@@ -86,6 +87,9 @@ class StageModel:
         y: Signal,
         start_memory: StartMemory = "end",
         surroundings: Mapping[str, ArrayLike] | None = None,
+        *,
+        uncertainty: bool = False,
+        age: float = 0.0,
     ) -> Any:
         """Return the voltage for a desired displacement of the stage, from an assumed initial state.
 
@@ -102,19 +106,36 @@ class StageModel:
             Assumed initial state, `AxisModel.initial`: ``end`` (default) or ``start`` of the record, or ``wiped``.
         surroundings : mapping of str to array_like, shape (N,), optional
             As for `simulate`.
+        uncertainty : bool
+            Whether to return the standard uncertainty of the displacement, too. ModelError if the model does not hold
+            what it needs. Default False.
+        age : float, seconds
+            Time from the last reset or calibration to the first sample, for the uncertainty. Default 0.
 
         Returns
         -------
-        ndarray, shape (N,), or dict of axis name to ndarray, shape (N,), volts
+        voltage : ndarray, shape (N,), or dict of axis name to ndarray, shape (N,), volts
             In the form of `y`, within the identified voltage range. For displacements slightly outside the reachable
             range the voltage is held at the limit, with a `HeldAtLimitWarning`.
+        standard uncertainty : the same in metres, only with `uncertainty`
+            Of the displacement about the reachable desired one; `AxisUncertainty.budget` is the same by component.
         """
         answers = self.command(t, y, start_memory=start_memory, surroundings=surroundings)
         for _, held in answers.values():
             if held.any():
                 warnings.warn(held_message(held), HeldAtLimitWarning, stacklevel=2)
         voltage = {name: v for name, (v, _) in answers.items()}
-        return voltage if isinstance(y, Mapping) else next(iter(voltage.values()))
+        if not uncertainty:
+            return voltage if isinstance(y, Mapping) else next(iter(voltage.values()))
+        time, desired = self._signals(t, y, "displacement")
+        known = {key: _as_array(values, key) for key, values in (surroundings or {}).items()}
+        spread = {}
+        for name, v in voltage.items():
+            own = self.uncertainty(name, start_memory)
+            spread[name] = own.budget(time, desired[name], v, age, known).combined
+        if isinstance(y, Mapping):
+            return voltage, spread
+        return next(iter(voltage.values())), next(iter(spread.values()))
 
     def command(
         self,
@@ -213,6 +234,14 @@ class StageModel:
         Other axes are assumed at rest; `start_memory` is as in `compensate`.
         """
         return self.axis(axis).stream(start_memory=start_memory)
+
+    def uncertainty(self, axis: str, start_memory: StartMemory = "end") -> AxisUncertainty:
+        """Return the uncertainty of one axis: ``budget`` along a path, ``stream`` sample by sample beside `stream`.
+
+        ModelError if the model does not hold what it needs.
+        """
+        with _naming(axis, "uncertainty"):
+            return AxisUncertainty(self.axis(axis), start_memory)
 
     def streams(self, start_memory: StartMemory = "end") -> StageStream:
         """Return a causal compensator of all axes, ``step(t, {axis: y}) -> {axis: v}``, seconds and metres to volts.

@@ -4,6 +4,7 @@ import math
 import time
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from datetime import UTC, datetime
 from typing import Any
 
 import numpy as np
@@ -57,7 +58,7 @@ from slpi_ros.nodes.surroundings import SurroundingsTopics
 
 # Minimum time between two log messages of the same kind, seconds.
 LOG_PERIOD, FILE_LOG_PERIOD = 5.0, 60.0
-# Period of the watchdog check and of `tracking_error`, seconds.
+# Period of the watchdog check, of `tracking_error` and of `displacement_uncertainty`, seconds.
 WATCH_PERIOD = 0.05
 # Polling period of a simulated clock, seconds.
 SIMULATED_PERIOD = 1e-3
@@ -83,8 +84,8 @@ class Compensator(LifecycleNode):
 
     Subscribes to ``desired_displacement``, ``desired_trajectory``, ``measured_displacement``, ``stage_state``,
     ``stage_model``, ``voltage_trajectory_state`` and the topics of the quantities that the stage follows, publishes
-    ``voltage_command``, ``voltage_trajectory``, ``tracking_error`` and ``/diagnostics``, provides the services
-    ``~/reset_memory``, ``~/set_zero``, ``~/forget`` and ``~/arm``.
+    ``voltage_command``, ``voltage_trajectory``, ``tracking_error``, ``displacement_uncertainty`` and
+    ``/diagnostics``, provides the services ``~/reset_memory``, ``~/set_zero``, ``~/forget`` and ``~/arm``.
     Message types, units and QoS are documented in ``msg_schemas/README.md``, parameters in `compensator_parameters`.
     """
 
@@ -119,6 +120,7 @@ class Compensator(LifecycleNode):
         self.create_service(Trigger, "~/set_zero", self._on_set_zero)
         self._doubts: dict[str, str] = {}
         self._noted: set[str] = set()
+        self._uncertainty_unknown = ""
         self._calibrations: dict[str, Calibration] = {}
         self._beyond: dict[str, PathWatch] = {}
         # The age of one command for each report: reading the clock takes as long as compensating an axis.
@@ -192,6 +194,9 @@ class Compensator(LifecycleNode):
             Float64MultiArray, "voltage_command", COMMANDS, qos_overriding_options=OVERRIDABLE
         )
         self._error_publisher = self.create_lifecycle_publisher(JointState, "tracking_error", DIAGNOSTICS)
+        self._uncertainty_publisher = self.create_lifecycle_publisher(
+            JointState, "displacement_uncertainty", DIAGNOSTICS
+        )
         self._block_publisher = self.create_lifecycle_publisher(JointTrajectory, "voltage_trajectory", COMMANDS)
         on_desired: dict[str, tuple[Any, Any]] = {
             "JointState": (JointState, self._on_joint_state),
@@ -304,7 +309,9 @@ class Compensator(LifecycleNode):
     def _leave_topics(self) -> None:
         for subscription in self._subscriptions_of_state:
             self.destroy_subscription(subscription)
-        for publisher in (self._publisher, self._error_publisher, self._block_publisher):
+        for publisher in (
+            self._publisher, self._error_publisher, self._uncertainty_publisher, self._block_publisher
+        ):  # fmt: skip
             self.destroy_lifecycle_publisher(publisher)
 
     # Desired and measured displacements
@@ -679,6 +686,25 @@ class Compensator(LifecycleNode):
             self.get_logger().warning(f"rearmed at {volts(*controller.voltages)} V")
             self._report()
         self._publish_tracking_errors()
+        self._publish_uncertainty(now_ns)
+
+    def _publish_uncertainty(self, now_ns: int) -> None:
+        """Publish where the axes are and how uncertain that is, if anybody listens; else it is not computed."""
+        wanted = self._uncertainty_publisher.get_subscription_count() > 0
+        controller, now = self._controller, datetime.now(UTC)
+        why = controller.watch_uncertainty(wanted, now, now_ns)
+        if why != self._uncertainty_unknown:
+            self._uncertainty_unknown = why
+            if why:
+                self.get_logger().warning(f"displacement_uncertainty is not published: {why}")
+        known = [(axis, spread) for axis in controller.axes if (spread := axis.uncertainty) is not None]
+        if not wanted or why or not known:
+            return
+        message = JointState(name=[axis.name for axis, _ in known])
+        message.position.extend(axis.expected for axis, _ in known)
+        message.effort.extend(spread for _, spread in known)
+        message.header.stamp = self.get_clock().now().to_msg()
+        self._uncertainty_publisher.publish(message)
 
     def _watch_learning(self) -> None:
         """Take what was learned, and log once what keeps it from going on."""

@@ -68,7 +68,7 @@ def write_files(folder: Path, found: Verification) -> None:
         page.tiles(_figures(axis))
         page.section("Errors by record")
         page.table(*_records_table(axis))
-        page.lines([f"{record.error.name}: {line}" for record in axis.records for line in _notes(record)])
+        page.lines([f"{record.error.name}: {line}" for record in axis.records for line in record_notes(record)])
         page.section("Errors by level, speed and region")
         page.table(*_parts_table(axis))
         for number, record in enumerate(axis.records):
@@ -133,7 +133,7 @@ def describe_verification(found: Verification, *, details: bool = True) -> list[
         for record in axis.records:
             error = [_error(record)] if len(axis.records) > 1 else []
             followed = _tracking_notes(record.tracking) if record.tracking else []
-            told += [f"{record.error.name}: {line}" for line in (*error, *followed, *_notes(record))]
+            told += [f"{record.error.name}: {line}" for line in (*error, *followed, *record_notes(record))]
         if not any(record.tracking for record in axis.records):
             told.append("path: not judged, no bag holds desired_displacement or desired_trajectory")
         parts = (axis.overall, axis.rest, *axis.by_level, *axis.by_speed, *axis.by_region) if details else ()
@@ -197,7 +197,7 @@ def _judged_share(record: RecordVerification) -> str:
     return f"{'WARNING: only ' if record.share < FEW else ''}{said}{why}"
 
 
-def _notes(record: RecordVerification) -> list[str]:
+def record_notes(record: RecordVerification) -> list[str]:
     """Return the assumptions about a record's initial state, and findings other than the error."""
     if record.known_from is None:
         notes = ["the initial state is unknown: it is estimated from the record"]

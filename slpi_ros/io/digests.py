@@ -1,0 +1,34 @@
+"""SHA-256 of files, by which a document names what it rests on."""
+
+import hashlib
+import os
+from pathlib import Path
+
+from slpi_ros.errors import RecordError
+from slpi_ros.io.input_limits import BAG_BYTES, open_input
+
+# Bytes that are read at once.
+PART = 1 << 20
+
+
+def digests(path: str | os.PathLike[str]) -> dict[str, str]:
+    """Return the SHA-256 (64 hexadecimal digits) of a file, or of each file in a folder, by name; RecordError if not.
+
+    Equal to what ``sha256sum`` prints.
+    """
+    place = Path(path)
+    try:
+        if not place.is_dir():
+            return {place.name: _digest(place)}
+        return {each.name: _digest(each) for each in sorted(place.iterdir()) if each.is_file()}
+    except (OSError, ValueError) as error:
+        reason = error.strerror if isinstance(error, OSError) else error
+        raise RecordError(f"{path}: cannot be read for its SHA-256: {reason}; check the file") from None
+
+
+def _digest(path: Path) -> str:
+    found = hashlib.sha256()
+    with open_input(path, BAG_BYTES) as file:
+        while part := file.read(PART):
+            found.update(part)
+    return found.hexdigest()

@@ -1,0 +1,349 @@
+"""Standard uncertainty of the displacement that a model promises, as a budget by component (GUM, JCGM 100:2008).
+
+It is that of the displacement of the stage about the desired one, driven without feedback by the model's voltage.
+docs/explanation/uncertainty.md says what each component assumes, and what is not in it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, fields, replace
+from functools import cached_property
+from math import exp, hypot, inf, log1p, sqrt
+
+import numpy as np
+
+from slpi_ros.arrays import FloatArray
+from slpi_ros.effects.base import FollowedGain
+from slpi_ros.errors import ModelError
+from slpi_ros.model.axis_model import ABOVE_NOISE, RESOLUTION, AxisModel, Start, StartMemory
+
+# Equal parts of the displacement range for which a model document holds the error.
+REGIONS = 10
+# Coverage factor of an expanded uncertainty: about 95 % for a normal distribution.
+COVERAGE_FACTOR = 2.0
+# Standard deviation of a rectangular distribution of width 1.
+RECTANGULAR = 1.0 / sqrt(12.0)
+# An error with a cause that is not in the model is no chance: on another path it may stay at its bound. That of a
+# rectangular distribution is this multiple of its rms.
+SYSTEMATIC = sqrt(3.0)
+# Points of the table over the range, and steps of that of the memory to either end.
+POINTS, STEPS = 200, 32
+# Components of the budget, with what each of them is.
+COMPONENTS = {
+    "fit": "covariance of the fit to the records",
+    "left": "what the model leaves unexplained, and its resolution",
+    "uncovered": "regions and rates that the records do not cover",
+    "memory": "unknown memory of the hysteresis at the start, and creep from before it",
+    "age": "drift and creep since the last reset or calibration",
+    "surroundings": "recorded quantities: their gains, and values that are not known",
+}
+
+
+@dataclass(frozen=True)
+class Budget:
+    """Standard uncertainty (m) of a displacement by component, each of shape (N,)."""
+
+    fit: FloatArray
+    left: FloatArray
+    uncovered: FloatArray
+    memory: FloatArray
+    age: FloatArray
+    surroundings: FloatArray
+
+    @property
+    def combined(self) -> FloatArray:
+        """Combined standard uncertainty, shape (N,), metres; the components are independent of each other."""
+        return np.asarray(np.sqrt(sum(getattr(self, part.name) ** 2 for part in fields(self))))
+
+    @property
+    def expanded(self) -> FloatArray:
+        """Expanded uncertainty, shape (N,), metres, with the coverage factor `COVERAGE_FACTOR`."""
+        return COVERAGE_FACTOR * self.combined
+
+
+class AxisUncertainty:
+    """The uncertainty of one axis; ModelError if the model does not hold what it needs.
+
+    Parameters
+    ----------
+    axis : AxisModel
+    start_memory : str
+        Assumed initial state, as for `StageModel.compensate`.
+    known_memory : bool, optional
+        Whether this state is known. By default only that after ``wiped``: otherwise the stage may have moved since.
+    """
+
+    def __init__(self, axis: AxisModel, start_memory: StartMemory = "end", known_memory: bool | None = None) -> None:
+        quality = axis.quality
+        if quality.regions is None or quality.drift is None or quality.duration is None or quality.fastest is None:
+            raise ModelError(
+                "the model does not hold what its uncertainty needs (errors by region, drift); it is of an earlier "
+                "version: identify or diagnose again from its bags"
+            )
+        if not axis.causal:
+            raise ModelError(
+                f"the uncertainty of kind '{axis.kind}' is not known, as it needs the complete path in advance; "
+                "identify kind 'slpi'"
+            )
+        self._axis, self._start_memory = axis, start_memory
+        self.known_memory = start_memory == "wiped" if known_memory is None else known_memory
+        self.low, high = axis.displacement_range
+        self.stroke = high - self.low
+        self.scale = (POINTS - 1) / self.stroke
+        self.fastest = quality.fastest
+        self.fit, self.left, self.unvisited = self._by_displacement()
+        base = self.fit**2 + self.left**2
+        self.within = base + self.unvisited**2
+        # Beyond the record an error grows no further than to that of a stage that may be anywhere in its range.
+        self.most = RECTANGULAR * self.stroke
+        self.drift_square = quality.drift**2
+        self.duration = quality.duration
+        unsure = [effect.unsure for effect in axis.effects]
+        self.gain_drift_square = sum(one.gain_drift for one in unsure)
+        self.gain_origin = next((one.origin for one in unsure if one.gain_drift), 0.0)
+        # A stage creeps after moves that are anywhere in its range.
+        self.relaxations = [(tau, share * self.most) for one in unsure for tau, share in one.relaxations]
+        slope = self.stroke / (axis.voltage_range[1] - axis.voltage_range[0])
+        self.creep = hypot(*(hypot(one.slow_share * self.most, one.slow_volts * slope) for one in unsure))
+        self.quantities = [quantity for one in unsure for quantity in one.quantities]
+        self.quantity_origin = next((one.origin for one in unsure if one.quantities), 0.0)
+
+    def _by_displacement(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Return covariance of the fit, what is left, and unvisited regions, (`POINTS`,) each, m, over the range."""
+        quality = self._axis.quality
+        errors = np.array([np.nan if one is None else one for one in quality.regions or ()])
+        centres = (np.arange(REGIONS) + 0.5) / REGIONS
+        at = np.linspace(0.0, 1.0, POINTS)
+        visited = np.flatnonzero(np.isfinite(errors))
+        if not visited.size:
+            visited, errors = np.arange(REGIONS), np.full(REGIONS, quality.rms)
+        # The error of the fit is that of samples that were not fitted: larger than those fitted by the variance of the
+        # prediction, and those smaller than the true one by as much.
+        held_out = max(quality.held_out_rms, quality.left_out_rms or 0.0, quality.rms)
+        rms = max(quality.rms, 1e-300)
+        new = np.interp(at, centres[visited], errors[visited] * (held_out / rms)) ** 2
+        own = np.interp(at, centres[visited], errors[visited]) ** 2
+        variance = (new - own) / 2.0
+        noise = quality.floor_rms**2
+        left = np.maximum(new - variance - noise, 0.0)
+        if self._systematic:
+            left = left * SYSTEMATIC**2
+        left += (RESOLUTION * self.stroke) ** 2
+        # In a region without samples the error of the nearest one grows with the distance in regions.
+        distance = np.abs(at[:, None] - centres[visited]).min(axis=1) * REGIONS - 0.5
+        apart = np.where(distance > 1e-9, 1.0 + distance, 0.0) ** 2
+        # Of the pairs of turning points that no sample determines, the curves have as much variance as those of the
+        # others have been found to have, divided by the share of these.
+        uncovered = (1.0 - quality.covered) / max(quality.covered, 1e-2)
+        return np.sqrt(variance), np.sqrt(left), np.sqrt((variance + left) * (apart + uncovered))
+
+    @property
+    def _systematic(self) -> bool:
+        """Whether what is left has a cause that is not in the model: by the verdict, else by the noise."""
+        quality = self._axis.quality
+        if quality.verdict is None:
+            return max(quality.held_out_rms, quality.rms) > ABOVE_NOISE * quality.floor_rms
+        return quality.verdict in ("unexplained", "partly_named")
+
+    @cached_property
+    def memory_table(self) -> FloatArray:
+        """Square of the uncertainty (m^2) from the memory, after the voltage has gone down and up by so many steps.
+
+        Shape (`STEPS` + 1,) twice; the steps lead from the initial voltage to the lower and to the upper end of the
+        range.
+        """
+        axis = self._axis
+        low, high = axis.hysteresis_range
+        v0 = self.initial_voltage
+        down, up = np.linspace(v0, low, STEPS + 1), np.linspace(v0, high, STEPS + 1)
+        table = np.empty((STEPS + 1, STEPS + 1))
+        for k in range(STEPS + 1):
+            path = np.concatenate([down[: k + 1], up, [low, high]])
+            ways = []
+            for turns in ([high, v0], [high, low, v0]):
+                memory = replace(axis, start=Start(low, 0.0, (low,))).memory("start")
+                memory.forward_array(np.array(turns))
+                ways.append(memory.forward_array(path))
+            own = axis.memory(self._start_memory).forward_array(path)
+            # Once the whole range has been passed, all memories agree.
+            one, other = ((way - way[-1] - (own - own[-1]))[k + 1 : -2] for way in ways)
+            # Rectangular between the two extreme memories, about the assumed one.
+            table[k] = (one**2 + one * other + other**2) / 3.0
+        return table
+
+    @cached_property
+    def initial_voltage(self) -> float:
+        """Voltage (V) of the initial state, within the range."""
+        low, high = self._axis.hysteresis_range
+        return min(max(self._axis.initial(self._start_memory).voltage, low), high)
+
+    @cached_property
+    def _memory_steps(self) -> tuple[float, float]:
+        """Steps of `memory_table` for each volt below and above the initial voltage."""
+        low, high = self._axis.hysteresis_range
+        v0 = self.initial_voltage
+        return (STEPS / (v0 - low) if v0 > low else 0.0), (STEPS / (high - v0) if v0 < high else 0.0)
+
+    def budget(
+        self,
+        t: FloatArray,
+        y: FloatArray,
+        v: FloatArray,
+        age: float = 0.0,
+        surroundings: Mapping[str, FloatArray] | None = None,
+    ) -> Budget:
+        """Return the budget along a path.
+
+        Parameters
+        ----------
+        t : ndarray, shape (N,), seconds
+        y : ndarray, shape (N,), metres
+            Desired displacement.
+        v : ndarray, shape (N,), volts
+            Voltage for it.
+        age : float, seconds
+            Time from the last reset or calibration to the first sample. Default 0.
+        surroundings : mapping of str to ndarray, shape (N,), optional
+            Known values of the quantities that the stage follows.
+        """
+        place = np.clip((y - self.low) * self.scale, 0, POINTS - 1).astype(np.int64)
+        dt, dv = np.diff(t), np.abs(np.diff(v))
+        rate = np.concatenate([[0.0], np.divide(dv, dt, out=np.zeros_like(dv), where=dt > 0.0)])[: t.size]
+        since = age + (t - t[:1])
+        faster = np.maximum(rate / self.fastest - 1.0, 0.0) if self.fastest > 0.0 else np.zeros_like(t)
+        rates = np.minimum(self.within[place] * faster**2, self.most**2)
+        values = {} if surroundings is None else surroundings
+        return Budget(
+            fit=self.fit[place],
+            left=self.left[place],
+            uncovered=np.sqrt(self.unvisited[place] ** 2 + rates),
+            memory=np.sqrt(self._memory_square(v) + self._relaxing_square(since)),
+            age=np.sqrt(self._age_square(since, y)),
+            surroundings=np.sqrt(self._surroundings_square(values, y)),
+        )
+
+    def at(self, y: float, age: float) -> Budget:
+        """Return the budget, shape (1,), at a displacement (m) and a time (s) since a reset, at rates of the record."""
+        known = self if self.known_memory else AxisUncertainty(self._axis, self._start_memory, known_memory=True)
+        return known.budget(np.zeros(1), np.array([y]), np.zeros(1), age)
+
+    def _memory_square(self, v: FloatArray) -> FloatArray:
+        if self.known_memory:
+            return np.zeros_like(v)
+        v0, (down, up) = self.initial_voltage, self._memory_steps
+        low, high = np.minimum.accumulate(np.minimum(v, v0)), np.maximum.accumulate(np.maximum(v, v0))
+        lower = np.minimum((v0 - low) * down, STEPS).astype(np.int64)
+        upper = np.minimum((high - v0) * up, STEPS).astype(np.int64)
+        return self.memory_table[lower, upper]
+
+    def memory_square(self, lowest: float, highest: float) -> float:
+        """Return the square of the uncertainty (m^2) from the memory after voltages with these extremes (V)."""
+        if self.known_memory:
+            return 0.0
+        v0, (down, up) = self.initial_voltage, self._memory_steps
+        lower, upper = min((v0 - lowest) * down, STEPS), min((highest - v0) * up, STEPS)
+        return float(self.memory_table[max(int(lower), 0), max(int(upper), 0)])
+
+    def _relaxing_square(self, since: FloatArray) -> FloatArray:
+        """Return the square (m^2) of what still relaxes after the moves before the start, or those of the reset."""
+        return (
+            np.asarray(sum((size * np.exp(-since / tau) for tau, size in self.relaxations), np.zeros_like(since))) ** 2
+        )
+
+    def _age_square(self, since: FloatArray, y: FloatArray) -> FloatArray:
+        slow = self.drift_square + self.gain_drift_square * (y - self.gain_origin) ** 2
+        # The zero of the model is that at the beginning of its record.
+        return slow * (since + self.duration) + (self.creep * np.log1p(since / self.duration)) ** 2
+
+    def _surroundings_square(self, values: Mapping[str, FloatArray], y: FloatArray) -> FloatArray:
+        total = np.zeros_like(y)
+        for one in self.quantities:
+            total += _quantity_square(one, values.get(one.followed.key), y - self.quantity_origin)
+        return total
+
+    def stream(self, age: float = 0.0) -> "StreamingUncertainty":
+        """Return the same for samples one by one; `age` (s) is the time since the last reset or calibration."""
+        return StreamingUncertainty(self, age)
+
+
+class StreamingUncertainty:
+    """Standard uncertainty sample by sample: ``u = step(t, y, v)``, the same as `AxisUncertainty.budget`."""
+
+    def __init__(self, of: AxisUncertainty, age: float = 0.0) -> None:
+        self._of, self._age = of, age
+        self._within: list[float] = of.within.tolist()
+        self._low, self._scale = of.low, of.scale
+        self._drift = of.drift_square
+        self._more = bool(of.gain_drift_square or of.creep or of.quantities)
+        self._fastest = of.fastest if of.fastest > 0.0 else inf
+        self._values: dict[str, FloatArray] = {}
+        self._known = of.known_memory
+        self._memory = 0.0
+        self._extremes = of.initial_voltage, of.initial_voltage
+        self._since = 0.0
+        # Time (s), displacement (m) and voltage (V) of the last two samples.
+        self._before = self._last = (0.0, 0.0, 0.0)
+        # No voltage is within these, so that the first sample begins the range.
+        self._lowest, self._highest = inf, -inf
+
+    def reset(self, t: float) -> None:
+        """Note that the memory is known, and the age counts, from time `t` (s) on: after a reset."""
+        self._known, self._memory, self._age, self._since = True, 0.0, 0.0, t
+        self._lowest, self._highest = -inf, inf
+
+    def surround(self, values: Mapping[str, float]) -> None:
+        """Note values of quantities that the stage follows, by name, in their units."""
+        self._values.update({key: np.array([value]) for key, value in values.items()})
+
+    def note(self, t: float, y: float, v: float) -> None:
+        """Follow a sample: time (s), displacement (m) and its voltage (V)."""
+        if not self._lowest <= v <= self._highest:
+            self._reach(t, v)
+        self._before, self._last = self._last, (t, y, v)
+
+    def step(self, t: float, y: float, v: float) -> float:
+        """Return the standard uncertainty (m) of the displacement `y` (m) for the voltage `v` (V) at time `t` (s)."""
+        self.note(t, y, v)
+        return self.present
+
+    @property
+    def present(self) -> float:
+        """Standard uncertainty of the last displacement, metres."""
+        (before, _, v_before), (t, y, v) = self._before, self._last
+        place = int((y - self._low) * self._scale)
+        square = within = self._within[0 if place < 0 else place if place < POINTS else POINTS - 1]
+        dt, dv = t - before, abs(v - v_before)
+        if dv > self._fastest * dt and dt > 0.0:
+            square += min(within * (dv / dt / self._fastest - 1.0) ** 2, self._of.most**2)
+        since = self._age + (t - self._since)
+        if self._more:
+            square += self._others(since, y)
+        return sqrt(square + self._memory + self._drift * (since + self._of.duration))
+
+    def _reach(self, t: float, v: float) -> None:
+        """Note a voltage (V) beyond those so far, at time `t` (s)."""
+        if self._lowest > self._highest:
+            self._last, self._since = (t, 0.0, v), t
+            self._lowest, self._highest = self._extremes
+        self._lowest, self._highest = min(v, self._lowest), max(v, self._highest)
+        self._memory = 0.0 if self._known else self._of.memory_square(self._lowest, self._highest)
+
+    def _others(self, since: float, y: float) -> float:
+        """Return the square (m^2) of what few stages have: drift of the sensitivity, creep, followed quantities."""
+        of = self._of
+        square = of.gain_drift_square * (since + of.duration) * (y - of.gain_origin) ** 2
+        square += (of.creep * log1p(since / of.duration)) ** 2
+        square += sum(size * exp(-since / tau) for tau, size in of.relaxations) ** 2
+        moved = np.array([y - of.quantity_origin])
+        return square + sum(
+            float(_quantity_square(one, self._values.get(one.followed.key), moved)[0]) for one in of.quantities
+        )
+
+
+def _quantity_square(one: FollowedGain, value: FloatArray | None, moved: FloatArray) -> FloatArray:
+    """Return the square of the uncertainty (m^2) for values or None, `moved` (m) away from the origin."""
+    (zero, sensitivity), (own, of_sensitivity) = one.gains, one.uncertainty
+    if value is None:
+        # It is anywhere in its recorded range.
+        spread = RECTANGULAR * (one.followed.highest - one.followed.lowest)
+        return np.asarray(((zero + sensitivity * moved) * spread) ** 2)
+    return np.asarray((own**2 + (of_sensitivity * moved) ** 2) * (value - one.followed.reference) ** 2)

@@ -1,0 +1,294 @@
+"""The certificate of a verification: a page and a document for the files of a laboratory."""
+
+import platform
+from collections.abc import Sequence
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from slpi_ros.diagnosis.verify import RecordVerification, Verification
+from slpi_ros.errors import SlpiError, length
+from slpi_ros.io.atomic_file import all_or_nothing, make_folder
+from slpi_ros.io.digests import digests
+from slpi_ros.io.record import Record
+from slpi_ros.io.schemas import format_document
+from slpi_ros.model.axis_model import AxisModel
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.model.uncertainty import COMPONENTS, COVERAGE_FACTOR, AxisUncertainty
+from slpi_ros.reports.page import Page
+from slpi_ros.reports.uncertainty import PLACES, TIMES, uncertainty_document
+from slpi_ros.reports.verification import SEVERITY, record_notes
+
+SCHEMA = "slpi_ros/certificate/1"
+FILES = "certificate.json", "certificate.html"
+PROGRAMS = "slpi_ros", "numpy", "scipy"
+METHOD = (
+    "The voltage of each record is given to the model, and the displacement that it computes (free run, without any "
+    "reading of the sensor) is compared with the measured one: the error is measured - model.",
+    "An error is absolute; the one without offset is that without the constant part of each record.",
+    "Known delay, lag and periodic error of the sensor are taken out of its readings first.",
+    "A record proves something only if the model was not identified from it.",
+)
+
+
+@dataclass(frozen=True)
+class Verified:
+    """What a certificate rests on: the verification, its records and their bags, and the model and its file."""
+
+    verification: Verification
+    records: Sequence[Record]
+    bags: Sequence[str]
+    model: StageModel
+    model_file: str
+    own: Sequence[str] = ()  # bags that the model was identified from
+
+
+def certificate(of: Verified) -> dict[str, Any]:
+    """Return the certificate as a document, ``msg_schemas/certificate.schema.json``; RecordError if a file is gone."""
+    found = of.verification
+    ((_, digest),) = digests(of.model_file).items()
+    return {
+        "schema": SCHEMA,
+        "hardware_id": found.hardware_id or next((each.hardware_id for each in of.records if each.hardware_id), ""),
+        "issued": datetime.now(UTC).isoformat(timespec="seconds"),
+        "verdict": found.verdict,
+        "tolerance_m": found.tolerance,
+        "method": list(METHOD),
+        "model": {"source": of.model_file, "sha256": digest, "created": of.model.created},
+        "records": [
+            _record(record, bag, of.model, independent=bag not in of.own)
+            for record, bag in zip(of.records, of.bags, strict=True)
+        ],
+        "axes": {
+            name: {
+                "verdict": axis.verdict,
+                **_model(of.model.axes[name]),
+                "rms_m": axis.overall.rms,
+                "maximum_m": axis.overall.maximum,
+                "rest_rms_m": axis.rest.rms,
+                "rest_maximum_m": axis.rest.maximum,
+                "samples": axis.overall.samples,
+                "errors": [
+                    _errors(one, of.model.surrounded(record).axes[name], _age(of.model, record))
+                    for one, record in zip(axis.records, of.records, strict=True)
+                ],
+                **_uncertainty(of.model.axes[name]),
+            }
+            for name, axis in found.axes.items()
+        },
+        "versions": {"python": platform.python_version(), **{name: _version(name) for name in PROGRAMS}},
+    }
+
+
+def write_files(folder: Path, document: dict[str, Any]) -> None:
+    """Write ``certificate.json`` and ``certificate.html`` into `folder`, each atomically."""
+    make_folder(folder, *FILES)
+    with all_or_nothing(folder / FILES[0]) as file:
+        file.write(format_document(document, "certificate"))
+    stage, made = document["hardware_id"], document["model"]
+    page = Page("Certificate of verification" + (f" of stage {stage}" if stage else ""))
+    verdict = document["verdict"]
+    page.verdict("stage", _verdict(document), SEVERITY[verdict], verdict)
+    page.definitions(
+        {
+            "stage": stage or "unknown hardware id",
+            "issued": document["issued"],
+            "model": f"{made['source']}, identified {made['created'] or 'at an unknown time'}",
+            "SHA-256 of the model": made["sha256"],
+            "tolerance of the rms error": length(document["tolerance_m"]) if document["tolerance_m"] else "none given",
+        }
+    )
+    page.contents(tuple(document["axes"]))
+    page.heading("Method")
+    page.lines(document["method"])
+    page.heading("Records and conditions")
+    page.table(*_records_table(document))
+    for name, axis in document["axes"].items():
+        _show_axis(page, name, axis)
+    page.heading("Versions")
+    page.definitions(document["versions"])
+    page.write(folder / FILES[1])
+
+
+def _verdict(document: dict[str, Any]) -> str:
+    own = [record["source"] for record in document["records"] if not record["independent"]]
+    worst = max(axis["rms_m"] for axis in document["axes"].values())
+    dependent = f" It proves nothing on {', '.join(own)}, from which the model was identified." if own else ""
+    return f"The absolute error of the model is {length(worst)} rms on the worst axis.{dependent}"
+
+
+def _show_axis(page: Page, name: str, axis: dict[str, Any]) -> None:
+    page.heading(f"Axis {name}", name)
+    page.verdict(
+        name,
+        f"{axis['kind']}; {'; '.join(axis['effects']) or 'no effects'}",
+        SEVERITY[axis["verdict"]],
+        axis["verdict"],
+    )
+    (low, high), (v_low, v_high) = axis["displacement_range_m"], axis["voltage_range_V"]
+    page.tiles(
+        {
+            "range, µm": f"{low * 1e6:.4g} to {high * 1e6:.4g}",
+            "range, V": f"{v_low:.4g} to {v_high:.4g}",
+            "error, rms": length(axis["rms_m"]),
+            "at most": length(axis["maximum_m"]),
+            "without offset, rms": length(axis["rest_rms_m"]),
+            "without offset, at most": length(axis["rest_maximum_m"]),
+        }
+    )
+    page.section("Errors")
+    header = (
+        "record", "", "judged", "rms (nm)", "maximum (nm)", "offset (µm)", "rms without (nm)", "maximum without (nm)",
+        "limit (nm)", "initial state", "within 2 u",
+    )  # fmt: skip
+    rows = [
+        (
+            one["source"], one["verdict"], f"{one['samples']:,} ({one['share']:.0%})", f"{one['rms_m'] * 1e9:.1f}",
+            f"{one['maximum_m'] * 1e9:.1f}", f"{one['constant_m'] * 1e6:+.3f}", f"{one['rest_rms_m'] * 1e9:.1f}",
+            f"{one['rest_maximum_m'] * 1e9:.1f}", f"{one['limit_m'] * 1e9:.1f}", one["start"],
+            "not known" if one["within_expanded"] is None else f"{one['within_expanded']:.1%}",
+        )
+        for one in axis["errors"]
+    ]  # fmt: skip
+    page.table(header, rows)
+    page.lines([f"{one['source']}: {remark}" for one in axis["errors"] for remark in one["remarks"]])
+    page.section("Budget of uncertainty")
+    if axis["uncertainty"] is None:
+        page.text(f"Not known: {axis['uncertainty_unknown']}.")
+        return
+    _show_budget(page, axis["uncertainty"])
+
+
+def _show_budget(page: Page, uncertainty: dict[str, Any]) -> None:
+    budget = uncertainty["budget"]
+    middle = budget[len(PLACES) // 2 :: len(PLACES)]
+    rows: list[Sequence[str] | str] = [
+        (name, what, *(f"{one[f'{name}_m'] * 1e9:.1f}" for one in middle))
+        for name, what in (
+            *COMPONENTS.items(),
+            ("combined", "root of the sum of the squares"),
+            ("expanded", f"combined, with the coverage factor {COVERAGE_FACTOR:g}"),
+        )
+    ]
+    page.table(
+        ("component", "what it is", *TIMES),
+        rows,
+        caption="Standard uncertainty (nm) of the displacement that the model promises, at the middle of the range, by "
+        "the time since the last reset or calibration. Without a reset, besides "
+        f"{length(uncertainty['unknown_memory_m'])} at first, until the voltage has gone over its range.",
+    )
+    places = [budget[k :: len(PLACES)] for k in range(len(PLACES))]
+    page.table(
+        ("displacement (µm)", *TIMES),
+        [
+            (f"{those[0]['displacement_m'] * 1e6:.4g}", *(f"{one['expanded_m'] * 1e9:.1f}" for one in those))
+            for those in places
+        ],
+        caption=f"Expanded uncertainty (nm, k = {COVERAGE_FACTOR:g}) over the range.",
+    )  # fmt: skip
+
+
+def _records_table(document: dict[str, Any]) -> tuple[Sequence[str], list[Sequence[str] | str]]:
+    rows: list[Sequence[str] | str] = []
+    for one in document["records"]:
+        conditions = [f"{each['name']} {each['lowest']:.4g} to {each['highest']:.4g}" for each in one["surroundings"]]
+        rows.append(
+            (
+                one["source"],
+                one["begins"],
+                f"{one['duration_s']:.1f}",
+                "yes" if one["independent"] else "no: the model was identified from it",
+                ", ".join(conditions) or "not recorded",
+                "; ".join(f"{name} {digest}" for name, digest in one["files"].items()),
+            )
+        )
+    return ("record", "begins", "duration (s)", "independent", "surroundings", "SHA-256"), rows
+
+
+def _record(record: Record, bag: str, model: StageModel, *, independent: bool) -> dict[str, Any]:
+    begins, ends = int(record.time_ns[0]), int(record.time_ns[-1])
+    known = {key: record.surroundings[key][1] for key in model.quantities if key in record.surroundings}
+    return {
+        "source": bag,
+        "files": digests(bag),
+        "begins": _date(begins),
+        "duration_s": max(ends - begins, 0) * 1e-9,
+        "independent": independent,
+        "surroundings": [
+            {"name": key, "lowest": float(np.nanmin(values)), "highest": float(np.nanmax(values))}
+            for key, values in known.items()
+            if np.isfinite(values).any()
+        ],
+    }
+
+
+def _model(axis: AxisModel) -> dict[str, Any]:
+    return {
+        "kind": axis.kind,
+        "effects": [f"{effect.name}: {effect.describe()}" for effect in axis.effects],
+        "voltage_range_V": list(axis.voltage_range),
+        "displacement_range_m": list(axis.displacement_range),
+    }
+
+
+def _errors(one: RecordVerification, axis: AxisModel, age: float) -> dict[str, Any]:
+    told = one.to_document()
+    names = (
+        "source", "verdict", "samples", "share", "rms_m", "maximum_m", "constant_m", "rest_rms_m", "rest_maximum_m",
+        "limit_m", "limit_of", "repeatability_rms_m", "start",
+    )  # fmt: skip
+    return {
+        **{name: told[name] for name in names},
+        "voltage_range_V": [float(one.v.min()), float(one.v.max())],
+        "within_expanded": _within(one, axis, age),
+        "remarks": record_notes(one),
+    }
+
+
+def _within(one: RecordVerification, axis: AxisModel, age: float) -> float | None:
+    """Return the share of the judged samples with an error within the expanded uncertainty; None if not known."""
+    try:
+        own = AxisUncertainty(axis, known_memory=one.begins_known)
+    except SlpiError:
+        return None
+    courses = {key: np.interp(one.t, *course) for key, course in axis.surroundings.items()}
+    spread = own.budget(one.t, one.model, one.v, age, courses).combined
+    # What is read is the stage and the noise of its sensor.
+    allowed = COVERAGE_FACTOR * np.hypot(spread, axis.quality.floor_rms)[one.judged]
+    error = one.left + (one.constant if one.absolute else 0.0)
+    return float(np.mean(np.abs(error) <= allowed))
+
+
+def _age(model: StageModel, record: Record) -> float:
+    """Return the time (s) from the identification of a model to a record; 0 if it is not known."""
+    try:
+        made = datetime.fromisoformat(model.created)
+    except ValueError:
+        return 0.0
+    made = made if made.tzinfo else made.replace(tzinfo=UTC)
+    return max(int(record.time_ns[0]) * 1e-9 - made.timestamp(), 0.0)
+
+
+def _uncertainty(axis: AxisModel) -> dict[str, Any]:
+    try:
+        return {"uncertainty": uncertainty_document(axis), "uncertainty_unknown": ""}
+    except SlpiError as error:
+        return {"uncertainty": None, "uncertainty_unknown": str(error)}
+
+
+def _date(time_ns: int) -> str:
+    try:
+        return datetime.fromtimestamp(time_ns // 10**9, UTC).isoformat(timespec="seconds")
+    except (OverflowError, ValueError, OSError):
+        return ""
+
+
+def _version(package: str) -> str:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return "not installed"

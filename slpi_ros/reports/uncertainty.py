@@ -1,0 +1,74 @@
+"""The uncertainty of a model as text, and as part of a document: over time and over range, and its budget."""
+
+from dataclasses import fields
+from math import sqrt
+from typing import Any
+
+from slpi_ros.errors import SlpiError, length
+from slpi_ros.model.axis_model import AxisModel
+from slpi_ros.model.uncertainty import COMPONENTS, COVERAGE_FACTOR, AxisUncertainty, Budget
+
+# Times since the reset or calibration, seconds, and places in the displacement range, shares.
+TIMES = {"1 s": 1.0, "1 min": 60.0, "1 h": 3600.0}
+PLACES = (0.0, 0.25, 0.5, 0.75, 1.0)
+MIDDLE = 0.5
+RESET = f"expanded uncertainty (k = {COVERAGE_FACTOR:g}) after a reset"
+
+
+def describe_uncertainty(axis: AxisModel, *, details: bool = True) -> list[str]:
+    """Return the uncertainty of an axis as lines of text, in `details` with tables in nm; or why it is not known."""
+    try:
+        own = AxisUncertainty(axis, known_memory=True)
+    except SlpiError as error:
+        return [f"uncertainty: not known: {error}"]
+    told = [f"{length(float(_at(own, MIDDLE, seconds).expanded[0]))} after {name}" for name, seconds in TIMES.items()]
+    lines = [f"{RESET}, at the middle of the range: {', '.join(told)}"]
+    if unknown := unknown_memory(axis):
+        lines.append(
+            f"without a reset: besides, standard uncertainty {length(unknown)} at first, until the voltage has gone "
+            "over its range"
+        )
+    if not details:
+        return lines
+    lines.append(f"{RESET}, nm:")
+    lines.append(f"{'displacement, µm':<28}" + "".join(f"{name:>10}" for name in TIMES))
+    for share in PLACES:
+        y = own.low + share * own.stroke
+        figures = [float(own.at(y, seconds).expanded[0]) for seconds in TIMES.values()]
+        lines.append(f"{y * 1e6:<28.4g}" + "".join(f"{1e9 * each:10.1f}" for each in figures))
+    lines.append("budget at the middle of the range, standard uncertainty, nm:")
+    budgets = [_at(own, MIDDLE, seconds) for seconds in TIMES.values()]
+    for name, what in (*COMPONENTS.items(), ("combined", "root of the sum of squares"), ("expanded", "coverage 2")):
+        row = "".join(f"{1e9 * float(getattr(each, name)[0]):10.1f}" for each in budgets)
+        lines.append(f"{name:<28}{row}  {what}")
+    return lines
+
+
+def unknown_memory(axis: AxisModel) -> float:
+    """Return the standard uncertainty (m) from a memory that is not known, before anything moves."""
+    own = AxisUncertainty(axis)
+    return sqrt(own.memory_square(own.initial_voltage, own.initial_voltage))
+
+
+def uncertainty_document(axis: AxisModel) -> dict[str, Any]:
+    """Return the uncertainty of an axis as part of a certificate; ModelError if it is not known."""
+    own = AxisUncertainty(axis, known_memory=True)
+    return {
+        "coverage_factor": COVERAGE_FACTOR,
+        "unknown_memory_m": unknown_memory(axis),
+        "budget": [
+            {"time_s": seconds, "displacement_m": own.low + share * own.stroke, **_figures(_at(own, share, seconds))}
+            for seconds in TIMES.values()
+            for share in PLACES
+        ],
+    }
+
+
+def _at(own: AxisUncertainty, share: float, seconds: float) -> Budget:
+    return own.at(own.low + share * own.stroke, seconds)
+
+
+def _figures(budget: Budget) -> dict[str, float]:
+    """Return all figures (m) of a budget at one place."""
+    names = [*(part.name for part in fields(budget)), "combined", "expanded"]
+    return {f"{name}_m": float(getattr(budget, name)[0]) for name in names}

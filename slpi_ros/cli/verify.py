@@ -29,7 +29,7 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument(
         "--certificate", action="store_true",
         help="also write certificate.json and certificate.html into the folder of -o: stage, records with their "
-        "SHA-256, method, range, errors, budget of uncertainty, conditions, versions, verdict",
+        "SHA-256, method, range, errors, budget of uncertainty, conditions, versions, verdict; default: no",
     )  # fmt: skip
     common.add_output(command, "DIR", "folder of verification.json and report.html; default: none", required=False)
     command.add_argument(

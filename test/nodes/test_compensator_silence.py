@@ -90,8 +90,8 @@ def test_a_gap_in_a_trajectory_is_no_silence(x_file):
         reported = len(client.reports)
         client.graph.spin_until(lambda: len(client.reports) > reported + 4, "a while longer than the timeout")
         assert not any("no command" in said for said in messages(client)[reported:])
-        # On its way to the second point, which is an hour away.
-        assert "following a trajectory" in messages(client)[-1]
+        # On its way to the second point, which is an hour away; on a busy computer it tells how late it was.
+        assert "trajectory" in messages(client)[-1]
 
 
 def test_a_reset_is_no_silence(x_file):

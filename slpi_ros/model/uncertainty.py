@@ -8,12 +8,13 @@ from collections.abc import Mapping
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from math import exp, hypot, inf, log1p, sqrt
+from numbers import Real
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import FollowedGain
-from slpi_ros.errors import ModelError
+from slpi_ros.errors import ModelError, UsageError
 from slpi_ros.model.axis_model import ABOVE_NOISE, RESOLUTION, AxisModel, Start, StartMemory
 
 # Equal parts of the displacement range for which a model document holds the error.
@@ -204,7 +205,13 @@ class AxisUncertainty:
             Time from the last reset or calibration to the first sample. Default 0.
         surroundings : mapping of str to ndarray, shape (N,), optional
             Known values of the quantities that the stage follows.
+
+        Raises
+        ------
+        UsageError
+            If the age is negative or no finite number.
         """
+        require_age(age)
         place = np.clip((y - self.low) * self.scale, 0, POINTS - 1).astype(np.int64)
         dt, dv = np.diff(t), np.abs(np.diff(v))
         rate = np.concatenate([[0.0], np.divide(dv, dt, out=np.zeros_like(dv), where=dt > 0.0)])[: t.size]
@@ -262,7 +269,14 @@ class AxisUncertainty:
 
     def stream(self, age: float = 0.0) -> "StreamingUncertainty":
         """Return the same for samples one by one; `age` (s) is the time since the last reset or calibration."""
+        require_age(age)
         return StreamingUncertainty(self, age)
+
+
+def require_age(age: float) -> None:
+    """Raise UsageError if an age (s) is negative or no finite number."""
+    if not isinstance(age, Real) or not 0.0 <= float(age) < inf:
+        raise UsageError(f"age is {age!r}; give the seconds since the last reset or calibration, 0 or more")
 
 
 class StreamingUncertainty:

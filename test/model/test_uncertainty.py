@@ -15,7 +15,7 @@ from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.surroundings import Surroundings
-from slpi_ros.errors import ModelError
+from slpi_ros.errors import ModelError, UsageError
 from slpi_ros.model.axis_model import RESOLUTION, AxisModel, FitQuality, Start
 from slpi_ros.model.document import format_model, parse_model
 from slpi_ros.model.stage_model import StageModel
@@ -177,6 +177,12 @@ def test_compensate_returns_it_in_the_form_of_the_path():
     # After a reset the memory is known, and the drift begins anew.
     y = np.linspace(7e-6, 8e-6, 50)
     assert model.compensate(t, y, "wiped", uncertainty=True)[1][0] < model.compensate(t, y, uncertainty=True)[1][0]
+
+
+@pytest.mark.parametrize("age", [-1.0, np.nan, np.inf, "a", None])
+def test_an_age_is_a_time_since_something(age):
+    with pytest.raises(UsageError, match="age is"):
+        StageModel({"x": BARE}).compensate(np.arange(3.0), CONSTANT, uncertainty=True, age=age)
 
 
 @pytest.mark.parametrize("missing", ["regions", "drift", "duration", "fastest"])

@@ -114,7 +114,9 @@ def _passes(
     if source.start is not None:
         begin_ns = first_ns + round(1e9 * source.start)
     end_ns = last_ns if source.stop is None else first_ns + round(1e9 * source.stop)
-    count = max(0, int((end_ns - begin_ns) * 1e-9 / period + 1e-6))
+    # Its last reading stands for a whole interval, too: a bag of exactly one pass holds one.
+    interval_ns = float(np.median(np.diff(record.time_ns))) if len(record) > 1 else 0.0
+    count = max(0, int((end_ns - begin_ns + interval_ns) * 1e-9 / period + 1e-6))
     return [_Begun(begin_ns + round(1e9 * k * period), asked or None) for k in range(count)]
 
 

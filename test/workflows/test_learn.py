@@ -50,11 +50,11 @@ def message(start_ns, path):
     return STORE.types[TRAJECTORY](header(start_ns), joint_names=["x"], points=points)
 
 
-def bag_of(folder, path, *, trajectories=True, seed=0):
-    """Write a bag of some passes of one path, each as a trajectory or not told at all."""
+def bag_of(folder, path, *, trajectories=True, seed=0, readings=None):
+    """Write a bag of some passes of one path, or of so many readings, each as a trajectory or not told at all."""
     # The trajectory ends where the next one begins.
     path = np.append(path, path[0])
-    whole = np.concatenate([*[path[:-1]] * PASSES, path[-1:]])
+    whole = np.concatenate([*[path[:-1]] * PASSES, path[-1:]])[:readings]
     read = answered(whole, seed)
     stamps = START_NS + np.round(np.arange(whole.size) * 1e9 / RATE).astype(np.int64)
     states = [
@@ -109,6 +109,15 @@ def test_passes_by_their_period_where_nothing_was_recorded_but_the_stage(model, 
     assert len(told["axes"]["x"]["passes"]) == PASSES
     assert main([*words, "--period", "100", "--desired", str(table)]) == 1
     assert main([*words, "--period", "-1", "--desired", str(table)]) == 2
+
+
+@pytest.mark.parametrize(("readings", "code"), [(SIZE, 0), (SIZE - 1, 1)])
+def test_a_bag_of_exactly_one_pass_holds_one(readings, code, model, tmp_path):
+    t, y = desired()
+    bag = bag_of(tmp_path / "bag", y, trajectories=False, readings=readings)
+    write_table(tmp_path / "desired.csv", t, {"x": y}, "m")
+    words = ["learn", str(bag), "--model", str(model), "--desired", str(tmp_path / "desired.csv")]
+    assert main([*words, "-o", str(tmp_path / "next.csv")]) == code
 
 
 def test_what_is_no_document_of_this_path_is_refused(model, tmp_path):

@@ -17,6 +17,8 @@ from slpi_ros.model.axis_model import AxisModel
 
 # Gain of a step towards the desired path, at first.
 GAIN = 0.6
+# What keeps the error where it is, as long as passes still make it smaller.
+NOT_YET = "not yet learned"
 # A pass is worse than the best from this ratio of their errors on, beyond this many standard deviations of the noise.
 WORSE, WORSE_BY_NOISE = 1.1, 4.0
 # Times that learning goes back to the best pass without a better one since, and passes in a row that cannot be learned
@@ -216,7 +218,7 @@ class AxisLearner:
             self._offset = offset
         report = PassReport(
             len(self.passes) + 1, rms, absolute, offset, drift, int(np.count_nonzero(judged.bumps)), not reason,
-            reason or self._told, self.held or self.limited_by(drift), self.bandwidth,
+            reason or self._told, self.held or (self.limited_by(drift) if self.passes else NOT_YET), self.bandwidth,
         )  # fmt: skip
         self.passes.append(report)
         del self.passes[:-KEPT_PASSES]
@@ -343,7 +345,7 @@ class AxisLearner:
         learnable, beyond = self._power(power * (sure & known)), self._power(power * (sure & ~known))
         if max(learnable, beyond) < self.noise**2:
             return "drift" if abs(drift) > self.noise else "noise"
-        return "bandwidth" if beyond > learnable else "not yet learned"
+        return "bandwidth" if beyond > learnable else NOT_YET
 
     @property
     def left(self) -> ComplexArray:

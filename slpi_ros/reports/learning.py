@@ -69,7 +69,8 @@ def _over_passes(axis: AxisLearner) -> Chart:
     chart = Chart([Panel(PASS, ERROR)], "column", 320)
     numbers = np.array([float(one.number) for one in axis.passes])
     errors = np.maximum(np.array([one.error for one in axis.passes]), LEAST)
-    chart.line(0, "error", numbers, errors, AFTER)
+    draw = chart.line if numbers.size > 1 else chart.dots
+    draw(0, "error", numbers, errors, AFTER)
     if axis.noise > LEAST:
         chart.line(0, "noise", numbers, np.full(numbers.size, axis.noise), NOISE)
     unused = np.array([not one.learned for one in axis.passes])

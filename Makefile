@@ -46,7 +46,7 @@ help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
 	@echo 'make test       build, lint, types, docstrings, tests: ten minutes on two cores'
 	@echo 'make test-long  build, then the tests that take long, and properties with more examples'
-	@echo 'make test-jazzy    the versions of Ubuntu 24.04 with Python 3.12: the tests of make test'
+	@echo 'make test-jazzy    the versions of Ubuntu 24.04 with Python 3.12: the quick tests of make test'
 	@echo 'make test-newest   the same tests with the newest versions of today; make test-minimum with the oldest allowed'
 	@echo 'make docs       build, then the documentation site: docs/_build/html/index.html'
 	@echo 'make schemas    what the schemas say of effects, anew from the effects'
@@ -111,13 +111,13 @@ test-long: export SLPI_EXAMPLES = 100
 test-long: build
 	$(PYTEST) -m 'long or hypothesis'
 
-# All tests of `make test`.
+# The tests of `make test` that take no more than ten seconds.
 test-jazzy test-newest test-minimum:
 	@$(MAKE) --no-print-directory ENVIRONMENT=$(@:test-%=%) test-environment
 
 test-environment: build
 	$(VENV) tools/list_versions.py
-	$(PYTEST) -m 'not long'
+	$(PYTEST) -m 'not long and not slow'
 
 schemas: build
 	$(VENV) tools/make_schemas.py

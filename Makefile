@@ -107,7 +107,7 @@ test: build
 	@$(VENV) -m mypy & types=$$!; ($(PYTEST) -m 'not long'); tests=$$?; wait $$types && exit $$tests
 
 # Also every property, with more examples than in `make test`.
-test-long: export SLPI_EXAMPLES = 100
+test-long: export SLPI_EXAMPLES = 50
 test-long: build
 	$(PYTEST) -m 'long or hypothesis'
 
@@ -115,6 +115,7 @@ test-long: build
 test-jazzy test-newest test-minimum:
 	@$(MAKE) --no-print-directory ENVIRONMENT=$(@:test-%=%) test-environment
 
+test-environment: export SLPI_EXAMPLES = 10
 test-environment: build
 	$(VENV) tools/list_versions.py
 	$(PYTEST) -m 'not long and not slow'

@@ -405,8 +405,7 @@ class Axis:
         low, high = self.stream.accepted
         x = self._sensor.correct(displacement) if low <= displacement <= high else displacement
         expected = self._expected.span(now_ns) if self._expected and self._feedback else ()
-        own = self._applied if self._feedback else self.stream
-        told = expected[-1] if expected else own.uncoupled_displacement + self.stream.coupled
+        told = expected[-1] if expected else self.expected
         if fresh and isfinite(x):
             self._offsets.append((now_ns, x - told))
         self.check(displacement, "measured")
@@ -416,7 +415,7 @@ class Axis:
             return
         if self._feedback is None:
             self._close_loop()
-            expected, told = (), self._applied.uncoupled_displacement + self.stream.coupled
+            expected, told = (), self.expected
         assert self._feedback
         for each in expected:
             self._residuals.expect(each)

@@ -3,7 +3,7 @@
 from array import array
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import datetime
 from enum import Enum
 
 from numpy.typing import ArrayLike
@@ -36,7 +36,7 @@ from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.axis_model import StartMemory
 from slpi_ros.model.coupling import Coupling
 from slpi_ros.model.limits import PERIOD, Limits, decaying_turns
-from slpi_ros.model.stage_model import StageModel
+from slpi_ros.model.stage_model import StageModel, seconds_since
 from slpi_ros.model.streaming import StageStream
 
 OPEN_LOOP = LoopSettings(False, PidGains(0.0), 0.1)
@@ -363,8 +363,9 @@ class Controller:
         """
         for axis in self.axes:
             since = axis.zero.at or (self.model.created if self.model else "")
+            age = max(seconds_since(since, now.timestamp()) or 0.0, 0.0) if wanted else 0.0
             try:
-                axis.watch_uncertainty(wanted and self.model is not None, _seconds(since, now), now_ns)
+                axis.watch_uncertainty(wanted and self.model is not None, age, now_ns)
             except SlpiError as error:
                 return f"axis '{axis.name}': {error}"
         return ""
@@ -789,12 +790,3 @@ class Controller:
         self._stage = StageStream(streams, coupling, self.model.origins) if coupling.on else None
         for axis in self.axes:
             self.voltages[axis.place] = axis.voltage
-
-
-def _seconds(since: str, now: datetime) -> float:
-    """Return the time (s) from an ISO 8601 time to `now`; 0 if it is none, or to come."""
-    try:
-        then = datetime.fromisoformat(since)
-    except ValueError:
-        return 0.0
-    return max((now - (then if then.tzinfo else then.replace(tzinfo=UTC))).total_seconds(), 0.0)

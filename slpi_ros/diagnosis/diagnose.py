@@ -221,15 +221,13 @@ def _extension(model: AxisModel, selection: Selection, given: Given, source: str
 
 def _of_another_kind(selection: Selection) -> bool:
     """Return whether the effects leave so much that the physics is another, where they would not carry over."""
+    if not selection.named:
+        return False
     unsure = any(EFFECTS[named.name].free_course or named.alternatives for named in selection.named)
-    if unsure and _more_than_noise(selection, MUCH_LEFT):
+    left, repeats = selection.now.held_out.rms_of_records, _repeatability(selection.now).rms
+    if unsure and left > MUCH_LEFT * repeats:
         return _share_left(selection) > LEFT_BY_UNSURE
-    return _more_than_noise(selection) and _share_left(selection) > LEFT_OF_ERROR
-
-
-def _more_than_noise(selection: Selection, times: float = ABOVE_NOISE) -> bool:
-    """Return whether there are effects, and they leave more than so many `times` what does not repeat."""
-    return bool(selection.named) and selection.now.held_out.rms_of_records > times * _repeatability(selection.now).rms
+    return left > ABOVE_NOISE * repeats and _share_left(selection) > LEFT_OF_ERROR
 
 
 def _share_left(selection: Selection) -> float:
@@ -265,7 +263,9 @@ def _not_as_judged(after: Sequence[FreeRun], runs: Sequence[FreeRun], selection:
     if any(one.rms > NO_WORSE * given.rms for one, given in zip(after, runs, strict=True)):
         return True
     shown = 1.0 - rms_of(after) / rms_of(runs)
-    return _more_than_noise(selection) and shown < GAIN_SHOWN * (1.0 - _share_left(selection))
+    if not selection.named or shown >= GAIN_SHOWN * (1.0 - _share_left(selection)):
+        return False
+    return selection.now.held_out.rms_of_records > ABOVE_NOISE * _repeatability(selection.now).rms
 
 
 def _selected(base: Explanation, of_family: Evidence | None) -> Selection:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.learning.axis_learner import AxisLearner
+from slpi_ros.learning.axis_learner import HELD, AxisLearner
 from slpi_ros.learning.learner import FEWEST, Learner, path_identity, read_learned
 from slpi_ros.model.stage_model import StageModel
 
@@ -148,6 +148,11 @@ class AxisProgress:
     best: float
     limited_by: str
     reason: str
+
+    @property
+    def held(self) -> bool:
+        """Whether nothing more is learned until what was learned is forgotten."""
+        return self.limited_by.startswith(HELD)
 
 
 @dataclass(frozen=True)

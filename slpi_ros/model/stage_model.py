@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from datetime import UTC, datetime
 from functools import cached_property
 from typing import Any
 
@@ -289,6 +290,15 @@ def _naming(axis: str, what: str) -> Iterator[None]:
         yield
     except SlpiError as error:
         raise type(error)(f"axis '{axis}', {what}: {error}") from None
+
+
+def seconds_since(when: str, now: float) -> float | None:
+    """Return the time (s) from an ISO 8601 time, UTC unless it says another, to `now` (s since 1970); None: no time."""
+    try:
+        then = datetime.fromisoformat(when)
+    except ValueError:
+        return None
+    return now - (then if then.tzinfo else then.replace(tzinfo=UTC)).timestamp()
 
 
 def check_time(t: ArrayLike) -> FloatArray:

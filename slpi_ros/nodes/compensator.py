@@ -32,7 +32,6 @@ from slpi_ros.compensator.validation import STALE, RejectedError
 from slpi_ros.errors import ModelError, SlpiError, shown
 from slpi_ros.io.cdr import multiarray_header
 from slpi_ros.io.messages import SECOND_NS, JointStates, decode_trajectory, encode_trajectory
-from slpi_ros.learning.axis_learner import HELD
 from slpi_ros.model.document import load_model
 from slpi_ros.model.limits import volts
 from slpi_ros.model.stage_model import StageModel
@@ -714,7 +713,7 @@ class Compensator(LifecycleNode):
         learning.poll(self._clocks()[1])
         while learning.remarks:
             self.get_logger().warning(learning.remarks.popleft())
-        held = {name for name, one in learning.progress.items() if one.limited_by.startswith(HELD)}
+        held = {name for name, one in learning.progress.items() if one.held}
         for name in held - self._learning_held:
             self.get_logger().warning(f"axis '{name}': learning is {learning.progress[name].limited_by}; call ~/forget")
         self._learning_held = held

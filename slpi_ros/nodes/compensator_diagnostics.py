@@ -2,7 +2,6 @@
 
 import time
 from collections.abc import Iterator
-from datetime import UTC, datetime
 
 from rclpy.node import Node
 
@@ -11,8 +10,7 @@ from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.feedback import Drift
 from slpi_ros.compensator.persistence import KNOWN, RESETTING, RESTORED
 from slpi_ros.compensator.statistics import Timing, TimingReport
-from slpi_ros.learning.axis_learner import HELD
-from slpi_ros.model.stage_model import StageModel
+from slpi_ros.model.stage_model import StageModel, seconds_since
 from slpi_ros.nodes.common import ERROR, WARN, Diagnostics, Health
 from slpi_ros.nodes.compensator_parameters import CompensatorSettings
 from slpi_ros.nodes.path_learning import OFF, PathLearning
@@ -62,7 +60,7 @@ class Reporter:
                 values[f"{key}.age_s"] = f"{age * 1e-9:.3f}" if age is not None else ""
         problems = tuple((level, text) for wrong, level, text in self._problems(settings) if wrong)
         for name, progress in learning.progress.items():
-            if progress.limited_by.startswith(HELD):
+            if progress.held:
                 problems = (*problems, (WARN, f"axis '{name}': learning is {progress.limited_by}"))
         hardware_id = settings.values["hardware_id"] or (model.hardware_id if model else "")
         self._diagnostics.report(Health(problems, self._summary(), values, hardware_id))
@@ -307,9 +305,5 @@ def remedy(axis: Axis, drift: Drift) -> str:
 
 def _hours_since(created: str) -> str:
     """Return the hours since an ISO 8601 time; "" if it is not valid."""
-    try:
-        then = datetime.fromisoformat(created)
-    except ValueError:
-        return ""
-    age = datetime.now(UTC) - (then if then.tzinfo else then.replace(tzinfo=UTC))
-    return f"{age.total_seconds() / 3600:.2f}"
+    age = seconds_since(created, time.time())
+    return "" if age is None else f"{age / 3600:.2f}"

@@ -7,7 +7,6 @@ from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import partial
 from multiprocessing.connection import Connection
 from typing import Any
 
@@ -185,7 +184,7 @@ class PathLearning:
                 self.passes.end(clock_ns)
             done = tuple(self.passes.take(clock_ns))
             if done and self.waiting < MOST_WAITING:
-                self._ask(partial(_given, done))
+                self._ask(lambda: done)
 
     def forget(self) -> None:
         """Begin anew from the desired paths; `on_forgotten` is called when the files are removed."""
@@ -234,7 +233,3 @@ class PathLearning:
         with normal_scheduling():
             self._process.start()
         other.close()
-
-
-def _given(request: Request) -> Request:
-    return request

@@ -17,7 +17,7 @@ from slpi_ros.io.digests import digests
 from slpi_ros.io.record import Record
 from slpi_ros.io.schemas import format_document
 from slpi_ros.model.axis_model import AxisModel
-from slpi_ros.model.stage_model import StageModel
+from slpi_ros.model.stage_model import StageModel, seconds_since
 from slpi_ros.model.uncertainty import COMPONENTS, COVERAGE_FACTOR, AxisUncertainty
 from slpi_ros.reports.page import Page
 from slpi_ros.reports.uncertainty import PLACES, TIMES, uncertainty_document
@@ -265,12 +265,7 @@ def _within(one: RecordVerification, axis: AxisModel, age: float) -> float | Non
 
 def _age(model: StageModel, record: Record) -> float:
     """Return the time (s) from the identification of a model to a record; 0 if it is not known."""
-    try:
-        made = datetime.fromisoformat(model.created)
-    except ValueError:
-        return 0.0
-    made = made if made.tzinfo else made.replace(tzinfo=UTC)
-    return max(int(record.time_ns[0]) * 1e-9 - made.timestamp(), 0.0)
+    return max(seconds_since(model.created, int(record.time_ns[0]) * 1e-9) or 0.0, 0.0)
 
 
 def _uncertainty(axis: AxisModel) -> dict[str, Any]:

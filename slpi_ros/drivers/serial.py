@@ -27,9 +27,11 @@ class SerialDevice(Device):
         self._stream = SerialStream(self.name, port, baud, self._dialect.ignored.encode("latin-1"))
         self._end = self._dialect.end.encode("latin-1")
         self._error = re.compile(self._dialect.error, re.DOTALL)
+        self._unanswered = ""
 
     def open(self) -> Found:
         """Connect, then only ask."""
+        self._unanswered = ""
         self._stream.open()
         return self._found()
 
@@ -114,12 +116,19 @@ class SerialDevice(Device):
         self._send(text)
         if self._dialect.written:
             self._line(text)
+        else:
+            self._unanswered = text
 
     def _ask(self, question: str) -> str:
         self._send(question)
         return self._line(question)
 
     def _send(self, text: str) -> None:
+        # A command that has no answer may have been refused.
+        if self._unanswered and self._stream.pending():
+            answer = self._line(self._unanswered)
+            raise AnswerError(f"{self.name}: '{self._unanswered}' answered '{shown(answer, SHOWN)}', not asked for")
+        self._unanswered = ""
         self._stream.send(f"{text}{self._dialect.terminator}".encode("latin-1"))
 
     def _line(self, asked: str) -> str:

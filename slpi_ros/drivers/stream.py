@@ -41,9 +41,7 @@ class Stream(ABC):
         """Send data; AnswerError if something has come that nobody asked for."""
         if self._file() is None:
             raise LinkError(f"{self._name}: it is not open")
-        if self._pending():
-            self._receive("an answer without a question", TIMEOUT)
-        if self._buffer:
+        if self.pending():
             # An answer that comes late or twice would be taken for the next one.
             raise AnswerError(f"{self._name}: it sent {cut(self._buffer)} without having been asked")
         try:
@@ -62,14 +60,17 @@ class Stream(ABC):
         answer, self._buffer = self._buffer[:count], self._buffer[count:]
         return answer
 
+    def pending(self) -> bool:
+        """Tell whether something has come that was not taken."""
+        file = self._file()
+        if file is not None and select.select([file], [], [], 0.0)[0]:
+            self._receive("an answer without a question", TIMEOUT)
+        return bool(self._buffer)
+
     def require_end(self) -> None:
         """Raise AnswerError if more has come than what was taken."""
         if self._buffer:
             raise AnswerError(f"{self._name}: it sent {cut(self._buffer)} beyond what was asked")
-
-    def _pending(self) -> bool:
-        file = self._file()
-        return file is not None and bool(select.select([file], [], [], 0.0)[0])
 
     def _receive(self, what: str, seconds: float) -> None:
         """Add what has come to the buffer, waiting for it if there is nothing."""

@@ -1,6 +1,7 @@
 """Devices at a serial port against simulated ones at a pseudo terminal, and dialects in YAML."""
 
 import math
+import time
 
 import pytest
 from drivers.kinds import KINDS
@@ -8,6 +9,7 @@ from drivers.kinds import KINDS
 from slpi_ros.drivers.base import Channel, LinkError, RefusedError, UnsuitableError
 from slpi_ros.drivers.dialects import DIALECTS, Dialect, dialect_of
 from slpi_ros.drivers.registry import make_device
+from slpi_ros.drivers.stream import SerialStream
 from slpi_ros.errors import UsageError
 from slpi_ros.simulation.devices.serial import MdtSimulator, Nv200Simulator
 
@@ -82,10 +84,20 @@ def test_a_device_that_commands_do_not_set_is_refused(place):
         at("nv200", place).open()
 
 
-def test_an_error_of_a_command_that_has_no_answer_is_told_with_the_next_one(place):
+@pytest.mark.parametrize("late", [False, True])
+def test_an_error_of_a_command_that_has_no_answer_is_told_with_the_next_one(place, monkeypatch, late):
     with Nv200Simulator(path=place) as simulator:
         device = at("nv200", place)
         device.open()
+        if late:
+            # The error is there before the next question is sent.
+            send = SerialStream.send
+
+            def send_and_wait(stream, data):
+                send(stream, data)
+                time.sleep(0.1)
+
+            monkeypatch.setattr(SerialStream, "send", send_and_wait)
         with pytest.raises(RefusedError, match="error,10"):
             device.write([140.0])
         assert simulator.log == []

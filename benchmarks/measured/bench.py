@@ -8,17 +8,23 @@ within its own 95 % interval of it. The environment variable SLPI_MEASURED_DATA 
 task.
 """
 
-import argparse
+# To be set before NumPy is imported: the processes share the cores.
 import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+import argparse
 import sys
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict
+from functools import partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
 from benchmarks import kept
-from benchmarks.measured.manifest import Manifest, read_manifest
+from benchmarks.measured.manifest import Manifest, Task, read_manifest
 from benchmarks.measured.methods import METHODS, Method
 from benchmarks.measured.scores import Score, Tables, score
 
@@ -53,43 +59,50 @@ def table(rows: Mapping[str, Mapping[str, Mapping[str, Any]]], figure: str) -> l
         cells = []
         for name in names:
             cell = row.get(name, {})
-            cells.append(f"{cell[figure]:.3f}{marked.get(name) or ' '}" if figure in cell else "refused ")
+            absent = "refused " if "rms" not in cell else "- "
+            cells.append(f"{cell[figure]:.3f}{marked.get(name) or ' '}" if figure in cell else absent)
         lines.append(f"{label:<42}" + "".join(f"{cell:>12}" for cell in cells))
     return lines
 
 
 def run(
-    manifest: Manifest, folder: Path, tasks: Sequence[str], methods: Sequence[Method], keep: bool
+    manifest: Manifest, folder: Path, tasks: Sequence[str], methods: Sequence[Method], keep: bool, processes: int = 1
 ) -> dict[str, dict[str, dict[str, Any]]]:
     """Score every method on every task; return the cells by row and method."""
-    tables = Tables(folder)
+    chosen = [task for task in manifest.tasks if task.name in tasks]
     rows: dict[str, dict[str, dict[str, Any]]] = dict(kept.read(SECTION).get("figures", {})) if keep else {}
-    for task in manifest.tasks:
-        if task.name not in tasks:
-            continue
-        began = time.perf_counter()
-        found: dict[str, dict[str, dict[str, Any]]] = {}
-        for method in methods:
-            for part, cell in score(tables, task, method).items():
-                label = f"{task.name}: {part}"
-                found.setdefault(label, {})[method.name] = _rounded(cell)
-        for label, row in found.items():
-            rows[label] = {**rows.get(label, {}), **row}
-        print(f"\n{task.name}, fitted to {'; '.join(map(str, task.fitted))} ({time.perf_counter() - began:.0f} s)")
-        print("\n".join(table(found, "rms")), flush=True)
-        for label, row in found.items():
-            for name, figures in row.items():
-                if said := figures.get("said") or figures.get("refused"):
-                    print(f"  {label}, {name}: {said}")
-        if keep:
-            kept.write(SECTION, COMMAND, rows)
+    with get_context("spawn").Pool(processes) as pool:
+        for task, (found, seconds) in zip(
+            chosen, pool.imap(partial(_scored, folder, [one.name for one in methods]), chosen, chunksize=1), strict=True
+        ):
+            for label, row in found.items():
+                rows[label] = {**rows.get(label, {}), **row}
+            print(f"\n{task.name}, fitted to {'; '.join(map(str, task.fitted))} ({seconds:.0f} s)")
+            print("\n".join(table(found, "rms")), flush=True)
+            for label, row in found.items():
+                for name, figures in row.items():
+                    if said := figures.get("said") or figures.get("refused"):
+                        print(f"  {label}, {name}: {said}")
+            if keep:
+                kept.write(SECTION, COMMAND, rows)
     return rows
+
+
+def _scored(folder: Path, names: Sequence[str], task: Task) -> tuple[dict[str, dict[str, dict[str, Any]]], float]:
+    """Return the cells of a task by row and method, and the time that it took, s."""
+    began, tables = time.perf_counter(), Tables(folder)
+    found: dict[str, dict[str, dict[str, Any]]] = {}
+    for method in METHODS:
+        if method.name in names:
+            for part, cell in score(tables, task, method).items():
+                found.setdefault(f"{task.name}: {part}", {})[method.name] = _rounded(cell)
+    return found, time.perf_counter() - began
 
 
 def _rounded(cell: Score | str) -> dict[str, Any]:
     if isinstance(cell, str):
         return {"refused": cell}
-    figures = {key: value for key, value in asdict(cell).items() if value != ""}
+    figures = {key: value for key, value in asdict(cell).items() if value not in ("", None)}
     return {key: round(value, 4) if isinstance(value, float) else value for key, value in figures.items()}
 
 
@@ -100,6 +113,7 @@ def main() -> int:
     parser.add_argument("--only", nargs="+", metavar="TASK", help="these tasks alone")
     parser.add_argument("--method", nargs="+", metavar="NAME", help="these methods alone")
     parser.add_argument("--keep", action="store_true", help=f"write the figures to {kept.KEPT.name}")
+    parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args()
     folder = data_folder()
     if folder is None:
@@ -107,10 +121,11 @@ def main() -> int:
     methods = [one for one in METHODS if one.name in (options.method or [one.name])]
     tasks = options.only or [task.name for task in manifest.tasks]
     began = time.perf_counter()
-    rows = run(manifest, folder, tasks, methods, options.keep)
+    rows = run(manifest, folder, tasks, methods, options.keep, options.processes)
     for title, figure in (
         ("rms error without its mean, % of range; * best, = within its own interval of the best", "rms"),
         ("rms error with its mean, % of range", "absolute"),
+        ("rms error of the voltage of the inverse, % of range", "inverse"),
         ("time of the fit, s", "fit_seconds"),
         ("time of a sample of a free run, us", "sample_microseconds"),
     ):

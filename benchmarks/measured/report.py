@@ -81,14 +81,16 @@ def full_tables(rows: Rows, date: str, command: str) -> str:
     for title, figure, text in (
         ("Without the mean error", "rms", "{0[rms]:.3f} ({0[low]:.3f} to {0[high]:.3f})"),
         ("With the mean error", "absolute", "{0[absolute]:.3f}"),
+        ("Inverse: error of the voltage, % of its range", "inverse", "{0[inverse]:.3f}"),
         ("Time of the fit, s", "fit_seconds", "{0[fit_seconds]:.1f}"),
         ("Time of a sample, µs", "sample_microseconds", "{0[sample_microseconds]:.2f}"),
     ):
         parts += ["", f"### {title}", "", f"| judged | {' | '.join(names)} |", f"|---|{'---|' * len(names)}"]
         for label, row in rows.items():
             known = {name: float(cell[figure]) for name, cell in row.items() if figure in cell}
-            best = min(known, key=lambda name: known[name]) if figure in ("rms", "absolute") else None
-            cells = [text.format(row[name]) if name in known else "refused" for name in names]
+            best = min(known, key=lambda name: known[name], default=None) if "seconds" not in figure else None
+            absent = {name: "-" if "rms" in row.get(name, {}) else "refused" for name in names}
+            cells = [text.format(row[name]) if name in known else absent[name] for name in names]
             cells = [f"**{cell}**" if name == best else cell for name, cell in zip(names, cells, strict=True)]
             parts.append(f"| {label} | {' | '.join(cells)} |")
     return "\n".join(parts)

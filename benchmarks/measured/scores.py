@@ -3,20 +3,26 @@
 import time
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.signal import savgol_filter
 
 from benchmarks.measured.manifest import Span, Task
-from benchmarks.measured.methods import Fitted, Method, Series, possible_histories
+from benchmarks.measured.methods import Fitted, Invertible, Method, Series, possible_histories
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.record import Record
 from slpi_ros.io.tables import import_table
 
 FloatArray = NDArray[np.float64]
+Mask = NDArray[np.bool_]
 
+# A record that was not fitted: the share of its judged part by which the history is chosen, and which is not judged.
+WARM_UP = 0.1
+# Samples and degree of the polynomial by which a measured displacement is smoothed before it is inverted.
+SMOOTHED = (11, 2)
 # Blocks of a judged part, draws, and the interval, %: neighbouring errors are alike, blocks nearly independent.
 BLOCKS, DRAWS, INTERVAL = 20, 1000, (2.5, 97.5)
 
@@ -35,6 +41,9 @@ class Score:
         Rms error with its mean.
     fit_seconds, sample_microseconds : float
         Time of the fit, and of a free run for each sample.
+    inverse : float, optional
+        Rms error of the voltage that the inverse gives for the measured displacement, smoothed and without the mean
+        error of the free run, % of the range of the voltage. None without an inverse.
     said : str
         What the method says of the fit.
     """
@@ -45,6 +54,7 @@ class Score:
     absolute: float
     fit_seconds: float
     sample_microseconds: float
+    inverse: float | None = None
     said: str = ""
 
 
@@ -92,7 +102,8 @@ def interval(error: FloatArray, seed: int = 0) -> tuple[float, float]:
 def score(tables: Tables, task: Task, method: Method) -> dict[str, Score | str]:
     """Fit a method, and return its errors on each judged part by name; the reason where it refuses.
 
-    The state at the start of a record is unknown to every method: each has the best of the same three histories.
+    The state at the start of a record is unknown to every method: of the same three histories each has the one with the
+    least error on samples that are not judged: the fitted part of the same record, or the first tenth of another one.
     """
     records = fitted_series(tables, task)
     began = time.perf_counter()
@@ -110,28 +121,57 @@ def _judged(
     model: Fitted, tables: Tables, task: Task, span: Span, records: Sequence[Series], took: float
 ) -> Score | str:
     one = tables.series(span.record, task.axis, [span])
-    counted = one.fitted & np.isfinite(one.y)
-    errors, seconds = [], []
-    for history in possible_histories(records):
+    chooses, judged = _split(one, records)
+    runs, seconds = [], []
+    histories = possible_histories(records)
+    for history in histories:
         began = time.perf_counter()
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
-                run = model.simulate(one.name, one.t, one.v, history)
-        except SlpiError as error:
-            return f"{type(error).__name__}: {error}"
+                runs.append(model.simulate(one.name, one.t, one.v, history))
+        except SlpiError as refusal:
+            return f"{type(refusal).__name__}: {refusal}"
         seconds.append(time.perf_counter() - began)
-        errors.append(run[counted] - one.y[counted])
-    best = min(errors, key=lambda error: float(np.std(error)))
-    share = 100.0 / float(np.ptp(one.y[counted]))
-    centred = share * (best - np.mean(best))
-    low, high = interval(centred)
+    best = min(range(len(runs)), key=lambda k: float(np.std((runs[k] - one.y)[chooses])))
+    error = (runs[best] - one.y)[judged]
+    share = 100.0 / float(np.ptp(one.y[judged]))
+    mean = float(np.mean(error))
+    low, high = interval(share * (error - mean))
     return Score(
-        rms=float(np.sqrt(np.mean(centred**2))),
+        rms=share * float(np.std(error)),
         low=low,
         high=high,
-        absolute=share * float(np.sqrt(np.mean(best**2))),
+        absolute=share * float(np.sqrt(np.mean(error**2))),
         fit_seconds=took,
         sample_microseconds=1e6 * min(seconds) / one.t.size,
+        inverse=_inverse(model, replace(one, y=one.y + mean), judged, histories[best]),
         said=str(getattr(model, "said", "")),
     )
+
+
+def _split(one: Series, records: Sequence[Series]) -> tuple[Mask, Mask]:
+    """Return the samples of a judged record that choose its history, and those that are judged."""
+    judged = one.fitted & np.isfinite(one.y)
+    for record in records:
+        if record.name == one.name:
+            return record.fitted & np.isfinite(record.y), judged
+    warm_up = np.zeros_like(judged)
+    warm_up[np.flatnonzero(judged)[: int(np.ceil(WARM_UP * judged.sum()))]] = True
+    return warm_up, judged & ~warm_up
+
+
+def _inverse(model: Fitted, one: Series, judged: Mask, history: tuple[float, ...]) -> float | None:
+    """Return the error of the inverse, % of the range of the voltage; None if there is none."""
+    if not isinstance(model, Invertible):
+        return None
+    known = np.isfinite(one.y)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            # Noise would make reversals that nobody desires.
+            y = savgol_filter(np.interp(one.t, one.t[known], one.y[known]), *SMOOTHED)
+            v = model.invert(one.name, one.t, y, history)
+    except (SlpiError, ValueError):
+        return None
+    return 100.0 * float(np.sqrt(np.mean((v - one.v)[judged] ** 2)) / np.ptp(one.v[judged]))

@@ -1,5 +1,6 @@
 """Every method of the measured records reproduces a system of its own class, and the scores count what they should."""
 
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -8,8 +9,8 @@ import pytest
 import slpi_ros
 from benchmarks.measured import bench, scores
 from benchmarks.measured.manifest import Span, Task
-from benchmarks.measured.methods import METHODS, Series, operators, possible_histories
-from benchmarks.measured.methods.base import Prepared, delayed
+from benchmarks.measured.methods import METHODS, Invertible, Series, operators, possible_histories
+from benchmarks.measured.methods.base import Prepared, Scale, delayed, invert_by_iteration
 from benchmarks.measured.methods.gru import GruMethod, forward, gradient
 from benchmarks.measured.methods.linear import Creep, Plays, Preisach, RatePlays
 from benchmarks.measured.methods.nonlinear import BoucWen, EnvelopePlays
@@ -89,6 +90,35 @@ def test_own_class(name):
     runs = [model.simulate("record", t, v, history) for history in possible_histories([record])]
     errors = [100.0 * np.std((run - y)[JUDGED:]) / np.ptp(y) for run in runs]
     assert min(errors) < LARGEST.get(name, 0.15)
+    # Networks and polynomials of past outputs have no inverse.
+    assert isinstance(model, Invertible) == (name not in ("NARX", "GRU"))
+    if isinstance(model, Invertible):
+        clean = 10.0 * system(name) + 3.0
+        found = [model.invert("record", t, clean, history) for history in possible_histories([record])]
+        assert min(np.std((own - v)[JUDGED:]) for own in found) < (0.02 if name in LARGEST else 0.01) * np.ptp(v)
+
+
+def test_an_inverse_that_does_not_converge_is_none():
+    class Falling:
+        def simulate(self, name, t, v, history):
+            return -v
+
+    t, v, _ = drive()
+    scale = Scale(5.0, 5.0, 0.0, 10.0)
+    with pytest.raises(ValueError, match="converge"):
+        invert_by_iteration(Falling(), scale, "record", t, v, ())
+
+
+def test_the_history_is_chosen_on_what_is_not_judged():
+    t, v, _ = drive()
+    fitted = np.arange(COUNT) < JUDGED
+    record = Series("a", t, v, v, fitted)
+    chooses, judged = scores._split(replace(record, fitted=~fitted), [record])
+    assert np.array_equal(chooses, fitted)
+    assert np.array_equal(judged, ~fitted)
+    chooses, judged = scores._split(replace(record, name="b"), [record])
+    assert np.flatnonzero(chooses).tolist() == list(range(JUDGED // 10))
+    assert np.flatnonzero(judged).tolist() == list(range(JUDGED // 10, JUDGED))
 
 
 def test_without_a_diagnosis_slpi_stays_as_it_is(monkeypatch):

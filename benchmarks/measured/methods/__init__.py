@@ -1,6 +1,6 @@
 """The methods that are compared, in the order of the table; a file for each family."""
 
-from benchmarks.measured.methods.base import Fitted, Method, Series, possible_histories
+from benchmarks.measured.methods.base import Fitted, Invertible, Method, Series, possible_histories
 from benchmarks.measured.methods.gru import GRU
 from benchmarks.measured.methods.linear import LINE, PI, PI_CREEP, PI_LAG, PI_RATE, PREISACH
 from benchmarks.measured.methods.narx import NARX
@@ -23,4 +23,4 @@ METHODS: tuple[Method, ...] = (
     SLPI_CAUSES,
 )
 
-__all__ = ["METHODS", "Fitted", "Method", "Series", "possible_histories"]
+__all__ = ["METHODS", "Fitted", "Invertible", "Method", "Series", "possible_histories"]

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,9 @@ LAGS = (0.0, *np.geomspace(0.5, 100.0, 10).tolist())
 DELAYS = (0.0, *np.geomspace(0.25, 30.0, 8).tolist())
 # A lag or delay is kept if it lowers the rms error of the fit by more than this share.
 WORTHWHILE = 0.01
+# Inverse by iteration: most steps, first share of the error, change (of half the range) at which it ends, largest error
+# (of the range) of a solution, and how far voltages may go (times half the range).
+ITERATIONS, FIRST_SHARE, CONVERGED, SOLVED, BEYOND = 80, 0.8, 1e-5, 0.005, 1.2
 
 
 @dataclass(frozen=True)
@@ -49,6 +52,15 @@ class Fitted(Protocol):
         `history` are the voltages (V) between which the actuator had moved before the record, oldest first; empty: it
         had never moved. `name` is that of the record: a fitted one has a constant and an initial state of its own.
         """
+        ...
+
+
+@runtime_checkable
+class Invertible(Protocol):
+    """A fitted model that has an inverse."""
+
+    def invert(self, name: str, t: FloatArray, y: FloatArray, history: tuple[float, ...]) -> FloatArray:
+        """Return the voltage (V), shape (N,), that gives the displacement `y`, (N,); ValueError if none is found."""
         ...
 
 
@@ -100,6 +112,34 @@ class Scale:
     def back(self, y: FloatArray) -> FloatArray:
         """Return shares as displacements."""
         return self.y_mean + self.y_range * y
+
+
+def invert_by_iteration(
+    model: Fitted, scale: Scale, name: str, t: FloatArray, y: FloatArray, history: tuple[float, ...]
+) -> FloatArray:
+    """Return the voltage (V), (N,), with which a free run gives `y`, (N,); ValueError if the steps do not converge.
+
+    The voltage moves by a share of the error (Picard), which converges for operators whose slope stays positive; the
+    share is halved where the error grows.
+    """
+    slope, share = scale.y_range / (2.0 * scale.v_half), FIRST_SHARE
+    low, high = scale.v_middle - BEYOND * scale.v_half, scale.v_middle + BEYOND * scale.v_half
+    v = np.clip(scale.v_middle + (y - scale.y_mean) / slope, low, high)
+    error = y - model.simulate(name, t, v, history)
+    for _ in range(ITERATIONS):
+        new = np.clip(v + share * error / slope, low, high)
+        left = y - model.simulate(name, t, new, history)
+        if float(np.std(left)) > float(np.std(error)):
+            share /= 2.0
+            continue
+        change, v, error = float(np.std(new - v)), new, left
+        if change < CONVERGED * scale.v_half:
+            break
+    if not float(np.std(error)) < SOLVED * scale.y_range:
+        raise ValueError(
+            f"the inverse does not converge: {100.0 * float(np.std(error)) / scale.y_range:.2g} % are left"
+        )
+    return v
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from benchmarks.measured.methods.base import (
     Scale,
     Series,
     delayed,
+    invert_by_iteration,
     possible_histories,
     prepare,
     rows_of,
@@ -157,6 +158,10 @@ class LinearModel:
         rows = np.arange(prepared.skipped, u.size)
         constant = self.constants.get(name, float(np.mean(list(self.constants.values()))))
         return self.scale.back(self.features.columns(prepared, u, rows) @ self.weights + constant)
+
+    def invert(self, name: str, t: FloatArray, y: FloatArray, history: tuple[float, ...]) -> FloatArray:
+        """Return the voltage, shape (N,)."""
+        return invert_by_iteration(self, self.scale, name, t, y, history)
 
 
 def solve(

@@ -13,6 +13,7 @@ from benchmarks.measured.methods.base import (
     FloatArray,
     Prepared,
     Series,
+    invert_by_iteration,
     search_lag,
 )
 from benchmarks.measured.methods.linear import (
@@ -134,6 +135,10 @@ class ModifiedModel:
         # The constant of a record is added behind the function.
         constant = self.base.constants.get(name, float(np.mean(list(self.base.constants.values()))))
         return scale.back(_bent(inner - constant, self.knots, self.values) + constant)
+
+    def invert(self, name: str, t: FloatArray, y: FloatArray, history: tuple[float, ...]) -> FloatArray:
+        """Return the voltage, shape (N,)."""
+        return invert_by_iteration(self, self.base.scale, name, t, y, history)
 
 
 def _bent(h: FloatArray, knots: FloatArray, values: FloatArray) -> FloatArray:

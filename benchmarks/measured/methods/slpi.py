@@ -28,18 +28,26 @@ class SlpiModel:
 
     def simulate(self, name: str, t: FloatArray, v: FloatArray, history: tuple[float, ...]) -> FloatArray:
         """Return the displacement, shape (N,)."""
+        return self._from(name, float(v[0]), history).simulate(t - t[0], v) / UNIT
+
+    def invert(self, name: str, t: FloatArray, y: FloatArray, history: tuple[float, ...]) -> FloatArray:
+        """Return the voltage, shape (N,), that the compensator would give, from the lowest voltage on."""
+        model = self._from(name, self.model.voltage_range[0], history)
+        reachable = np.clip(UNIT * y, *model.displacement_range)
+        return model.compensate(t - t[0], reachable, start_memory="start")[0]
+
+    def _from(self, name: str, v: float, history: tuple[float, ...]) -> AxisModel:
+        """Return the model at the start of a record that begins at `v` (V)."""
         model = self.model
         if name not in self.fitted:
             # Creep and rate law that continue from before a record belong to that record.
             model = replace(model, effects=tuple(settled(effect) for effect in model.effects))
-        seconds = t - t[0]
         if name == self.first and not history:
             # The state that the identification found for this record.
-            return model.simulate(seconds, v) / UNIT
-        path = np.array([model.start.voltage, *history, float(v[0])])
+            return model
+        path = np.array([model.start.voltage, *history, v])
         level = replace(model, effects=()).after(path)
-        start = Start(float(v[0]), level.displacement, history)
-        return replace(model, start=start).simulate(seconds, v) / UNIT
+        return replace(model, start=Start(v, level.displacement, history))
 
 
 def _record(one: Series) -> Record:

@@ -12,7 +12,7 @@ from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.arrays.rates import fastest
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
-from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of
+from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
 from slpi_ros.diagnosis.selection import BIAS, CONVERGED, Selection, contenders, is_own, seen, select
 from slpi_ros.diagnosis.significance import NO_WORSE, counts
@@ -36,7 +36,8 @@ REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
 # mean square), and if the free run of the extended model shows this share of the held-out gain.
 LEFT_OF_ERROR, GAIN_SHOWN = 0.6, 0.5
 # A drift, which may have any course, or a cause with alternatives may stand for a wrong hysteresis: if they leave more
-# than this multiple of the repeatability, at most this share of the error (a tenth of its mean square).
+# than this multiple of the repeatability, at most this share of the error (a tenth of its mean square). At a single drive
+# frequency every such cause only gives the loops another shape, and none that leaves so much is part of the model.
 MUCH_LEFT, LEFT_BY_UNSURE = 3.0, 0.316
 # Gauss-Newton steps of the selected effects with the hysteresis of the given model, which has more vertices; largest
 # ratio of the error of the coarser one to that with it.
@@ -226,7 +227,7 @@ def _of_another_kind(selection: Selection) -> bool:
     unsure = any(EFFECTS[named.name].free_course or named.alternatives for named in selection.named)
     left, repeats = selection.now.held_out.rms_of_records, _repeatability(selection.now).rms
     if unsure and left > MUCH_LEFT * repeats:
-        return _share_left(selection) > LEFT_BY_UNSURE
+        return one_speed(selection.now.evidence) or _share_left(selection) > LEFT_BY_UNSURE
     return left > ABOVE_NOISE * repeats and _share_left(selection) > LEFT_OF_ERROR
 
 

@@ -62,3 +62,14 @@ def test_a_gain_that_a_free_run_does_not_show_extends_nothing(measured_data):
     (found,) = diagnosis.axes.values()
     assert (found.effects, found.verdict) == ((), "unexplained")
     assert diagnosis.extended.axes == model.axes
+
+
+@pytest.mark.long
+def test_rates_that_stand_for_the_shape_of_loops_at_one_frequency_extend_nothing(measured_data):
+    # First-order reversal curves at 20 Hz: their turning points are not those that follow.
+    record = import_table(measured_data / "ferro_forc.csv")
+    model = slpi_ros.identify(record, stop=0.65)
+    diagnosis = slpi_ros.diagnose(record, model, stop=0.65)
+    (found,) = diagnosis.axes.values()
+    assert (found.effects, found.verdict) == ((), "unexplained")
+    assert diagnosis.extended.axes == model.axes

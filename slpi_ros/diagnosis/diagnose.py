@@ -36,8 +36,8 @@ REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
 # mean square), and if the free run of the extended model shows this share of the held-out gain.
 LEFT_OF_ERROR, GAIN_SHOWN = 0.6, 0.5
 # A drift, which may have any course, or a cause with alternatives may stand for a wrong hysteresis: if they leave more
-# than this multiple of the repeatability, at most this share of the error (a tenth of its mean square). At a single drive
-# frequency every such cause only gives the loops another shape, and none that leaves so much is part of the model.
+# than this multiple of the repeatability, at most this share of the error (a tenth of its mean square). At a single
+# drive frequency such a cause only gives the loops another shape, and none that leaves so much is part of the model.
 MUCH_LEFT, LEFT_BY_UNSURE = 3.0, 0.316
 # Gauss-Newton steps of the selected effects with the hysteresis of the given model, which has more vertices; largest
 # ratio of the error of the coarser one to that with it.

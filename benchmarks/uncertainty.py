@@ -13,6 +13,11 @@ arbitrary, and the noise of the sensor counts to its uncertainty. SLPI_MEASURED_
 A row passes from 90 to 99 %. The exit code is 1 if the simulated stages together are outside.
 """
 
+# To be set before NumPy is imported: the processes share the cores.
+import os
+
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
 import argparse
 import sys
 import time
@@ -20,6 +25,7 @@ import warnings
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import replace
+from multiprocessing import get_context
 
 import numpy as np
 from foreign import HIGHEST_V, NOISE_M, STAGES
@@ -94,8 +100,9 @@ def path(begin: float, low: float, high: float, rng: np.random.Generator) -> tup
     return np.concatenate(t), np.concatenate(y), np.concatenate(at)
 
 
-def judge(number: int, found: dict[str, list[FloatArray]]) -> None:
-    """Identify and diagnose a stage, drive it, and append the ratios of error to uncertainty by horizon."""
+def judge(number: int) -> tuple[str, dict[str, FloatArray]]:
+    """Identify and diagnose a stage, drive it; return a line of text, and ratios of error to uncertainty by horizon."""
+    found: dict[str, FloatArray] = {}
     name, physics = plant(number)
     began, rng = time.perf_counter(), np.random.default_rng([7, number])
     t, v = calibration_drive(0.0, HIGHEST_V, duration=RECORDED, rate=RATE, seed=number)
@@ -122,18 +129,17 @@ def judge(number: int, found: dict[str, list[FloatArray]]) -> None:
         ratio = np.abs(reached - desired) / u
         for place, horizon in enumerate(HORIZONS, 1):
             own = ratio[at == place]
-            found[f"{STARTS[memory]} {horizon}"].append(own)
+            found[f"{STARTS[memory]} {horizon}"] = own
             error, spread = (reached - desired)[at == place], u[at == place]
             said.append(
                 f"{np.mean(own <= COVERAGE_FACTOR):5.0%} ({1e9 * np.sqrt(np.mean(error**2)):.0f}/"
                 f"{1e9 * np.sqrt(np.mean(spread**2)):.0f})"
             )
     causes = ", ".join(effect.name for effect in axis.effects) or "none"
-    print(
-        f"{number:3} {name:34} {diagnosis.axes['x'].verdict:14} {causes:28} " + " ".join(f"{one:>18}" for one in said),
-        end="",
+    line = f"{number:3} {name:34} {diagnosis.axes['x'].verdict:14} {causes:28} " + " ".join(
+        f"{one:>18}" for one in said
     )
-    print(f" {time.perf_counter() - began:5.0f} s", flush=True)
+    return f"{line} {time.perf_counter() - began:5.0f} s", found
 
 
 def measured(found: dict[str, list[FloatArray]]) -> None:
@@ -186,12 +192,17 @@ def main() -> int:
     parser.add_argument("--stages", type=int, default=10, help="simulated stages")
     parser.add_argument("--first", type=int, default=0, help="number of the first one")
     parser.add_argument("--without-measured", action="store_true", help="simulated stages only")
+    parser.add_argument("--processes", type=int, default=2)
     options = parser.parse_args()
     found: dict[str, list[FloatArray]] = defaultdict(list)
     columns = [f"{start} {horizon}" for start in STARTS.values() for horizon in HORIZONS]
     print(f"share within 2 u (rms error / rms u, nm)\n{'':82}" + " ".join(f"{one:>18}" for one in columns))
-    for number in range(options.first, options.first + options.stages):
-        judge(number, found)
+    with get_context("spawn").Pool(options.processes) as pool:
+        numbers = range(options.first, options.first + options.stages)
+        for line, ratios in pool.imap(judge, numbers, chunksize=1):
+            print(line, flush=True)
+            for column, own in ratios.items():
+                found[column].append(own)
     if not options.without_measured:
         print("measured records, not fitted")
         measured(found)

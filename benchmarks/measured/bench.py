@@ -126,8 +126,8 @@ def main() -> int:
         ("rms error without its mean, % of range; * best, = within its own interval of the best", "rms"),
         ("rms error with its mean, % of range", "absolute"),
         ("rms error of the voltage of the inverse, % of range", "inverse"),
-        ("time of the fit, s", "fit_seconds"),
-        ("time of a sample of a free run, us", "sample_microseconds"),
+        ("processor time of the fit, s", "fit_seconds"),
+        ("processor time of a sample of a free run, us", "sample_microseconds"),
     ):
         print(f"\n{title}")
         print("\n".join(table(rows, figure)))

@@ -70,7 +70,7 @@ def _cost(rows: Rows) -> str:
     fit, sample = (np.median([cell[key] for cell in ours]) for key in ("fit_seconds", "sample_microseconds"))
     return (
         f"With causes, in the median of the rows, the error of PI is {gains[0]:.1f} times as large, that of PI with a "
-        f"lag {gains[1]:.1f} times; the fit takes {fit:.0f} s, a sample of a long simulation {sample:.1f} µs."
+        f"lag {gains[1]:.1f} times; the fit takes {fit:.0f} s of a processor, a sample of a free run {sample:.1f} µs."
     )
 
 
@@ -82,8 +82,8 @@ def full_tables(rows: Rows, date: str, command: str) -> str:
         ("Without the mean error", "rms", "{0[rms]:.3f} ({0[low]:.3f} to {0[high]:.3f})"),
         ("With the mean error", "absolute", "{0[absolute]:.3f}"),
         ("Inverse: error of the voltage, % of its range", "inverse", "{0[inverse]:.3f}"),
-        ("Time of the fit, s", "fit_seconds", "{0[fit_seconds]:.1f}"),
-        ("Time of a sample, µs", "sample_microseconds", "{0[sample_microseconds]:.2f}"),
+        ("Processor time of the fit, s", "fit_seconds", "{0[fit_seconds]:.1f}"),
+        ("Processor time of a sample, µs", "sample_microseconds", "{0[sample_microseconds]:.2f}"),
     ):
         parts += ["", f"### {title}", "", f"| judged | {' | '.join(names)} |", f"|---|{'---|' * len(names)}"]
         for label, row in rows.items():

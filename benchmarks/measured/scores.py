@@ -13,6 +13,7 @@ from scipy.signal import savgol_filter
 from benchmarks.measured.manifest import Span, Task
 from benchmarks.measured.methods import Fitted, Invertible, Method, Series, possible_histories
 from slpi_ros.errors import SlpiError
+from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.io.record import Record
 from slpi_ros.io.tables import import_table
 
@@ -21,8 +22,9 @@ Mask = NDArray[np.bool_]
 
 # A record that was not fitted: the share of its judged part by which the history is chosen, and which is not judged.
 WARM_UP = 0.1
-# Samples and degree of the polynomial by which a measured displacement is smoothed before it is inverted.
-SMOOTHED = (11, 2)
+# A measured displacement is smoothed before it is inverted, by polynomials of degree 2 over this share of a move from
+# turn to turn, at least so many samples. Turns of less than a share of the range do not count.
+SMOOTHED, FEWEST, SMALLEST = 0.05, 5, 0.02
 # Blocks of a judged part, draws, and the interval, %: neighbouring errors are alike, blocks nearly independent.
 BLOCKS, DRAWS, INTERVAL = 20, 1000, (2.5, 97.5)
 
@@ -40,7 +42,7 @@ class Score:
     absolute : float
         Rms error with its mean.
     fit_seconds, sample_microseconds : float
-        Time of the fit, and of a free run for each sample.
+        Processor time of the fit, and of a free run for each sample.
     inverse : float, optional
         Rms error of the voltage that the inverse gives for the measured displacement, smoothed and without the mean
         error of the free run, % of the range of the voltage. None without an inverse.
@@ -106,14 +108,14 @@ def score(tables: Tables, task: Task, method: Method) -> dict[str, Score | str]:
     least error on samples that are not judged: the fitted part of the same record, or the first tenth of another one.
     """
     records = fitted_series(tables, task)
-    began = time.perf_counter()
+    began = time.process_time()
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             model = method.fit(records)
     except (SlpiError, ValueError, np.linalg.LinAlgError) as error:
         return {str(span): f"{type(error).__name__}: {error}" for span in task.judged}
-    took = time.perf_counter() - began
+    took = time.process_time() - began
     return {str(span): _judged(model, tables, task, span, records, took) for span in task.judged}
 
 
@@ -125,14 +127,14 @@ def _judged(
     runs, seconds = [], []
     histories = possible_histories(records)
     for history in histories:
-        began = time.perf_counter()
+        began = time.process_time()
         try:
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")
                 runs.append(model.simulate(one.name, one.t, one.v, history))
         except SlpiError as refusal:
             return f"{type(refusal).__name__}: {refusal}"
-        seconds.append(time.perf_counter() - began)
+        seconds.append(time.process_time() - began)
     best = min(range(len(runs)), key=lambda k: float(np.std((runs[k] - one.y)[chooses])))
     error = (runs[best] - one.y)[judged]
     share = 100.0 / float(np.ptp(one.y[judged]))
@@ -161,6 +163,13 @@ def _split(one: Series, records: Sequence[Series]) -> tuple[Mask, Mask]:
     return warm_up, judged & ~warm_up
 
 
+def _window(one: Series) -> int:
+    """Return the odd number of samples over which a displacement is smoothed."""
+    v = one.v[np.isfinite(one.v)]
+    moves = np.diff(reversals(v, SMALLEST * float(np.ptp(v))))
+    return max(FEWEST, 2 * int(SMOOTHED * float(np.median(moves)) / 2.0) + 1)
+
+
 def _inverse(model: Fitted, one: Series, judged: Mask, history: tuple[float, ...]) -> float | None:
     """Return the error of the inverse, % of the range of the voltage; None if there is none."""
     if not isinstance(model, Invertible):
@@ -170,7 +179,7 @@ def _inverse(model: Fitted, one: Series, judged: Mask, history: tuple[float, ...
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
             # Noise would make reversals that nobody desires.
-            y = savgol_filter(np.interp(one.t, one.t[known], one.y[known]), *SMOOTHED)
+            y = savgol_filter(np.interp(one.t, one.t[known], one.y[known]), _window(one), 2)
             v = model.invert(one.name, one.t, y, history)
     except (SlpiError, ValueError):
         return None

@@ -192,6 +192,9 @@ class StreamingAround(Streaming, Protocol):
     def beside(self) -> float:
         """Displacement (m) beside that of the hysteresis."""
 
+    def undo(self, state: Any) -> None:
+        """Go back to `snapshot`, for the same sample once more."""
+
 
 class StreamingBase:
     """What streaming effects do unless they say otherwise: they have no state."""

@@ -410,10 +410,9 @@ def inverse_path(
                 if has_rate:
                     applied, u = reached, v_0
                     scale, way = laws.rate[1] * dt[n], reached - v_0
-                    rate[1] = rate[2] = rate[3] = 0.0
                     if scale > 0.0:
                         if way != 0.0:
-                            rate[1] = engine.solved(scale, laws.rate[0], abs(way), 0.0)
+                            rate[1] = engine.solved(scale, laws.rate[0], abs(way), rate[1])
                             u = engine.followed(laws.rate[0], reached, v_0, rate[1])
                     else:
                         u = v_0 + (reached - rate_0)

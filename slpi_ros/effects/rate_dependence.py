@@ -282,8 +282,13 @@ class StreamingRateDependence(StreamingBase):
 
     def restore(self, state: tuple[float, float]) -> None:
         """Replace the state by one returned by `snapshot`."""
+        self._w = self._before = self._earlier = 0.0
+        self.undo(state)
+
+    def undo(self, state: tuple[float, float]) -> None:
+        """Go back to the voltages before this sample; what it found remains the first guess."""
         self._v, self._u = state
-        self._wish, self._w, self._before, self._earlier = None, 0.0, 0.0, 0.0
+        self._wish = None
 
 
 def _records(context: ResidualContext) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:

@@ -385,7 +385,7 @@ class StreamingInverse:
         if reached != inside:
             memory.restore(state)
             if around:
-                around.restore(felt)
+                around.undo(felt)
                 reached = around.forward(elapsed, reached)
             memory.forward(reached)
         return v

@@ -134,3 +134,27 @@ def test_tutorial_without_ros(reader):
     assert passed == "True"
     table = np.loadtxt(reader.folder / "voltage.csv", delimiter=",", skiprows=1)
     assert table.shape == (400, 2) and np.isfinite(table).all()
+
+
+@pytest.mark.slow
+@pytest.mark.long
+def test_tutorial_with_a_temperature(reader):
+    (reader.folder / "make_days.py").write_text((DOCS / "examples" / "room" / "make_days.py").read_text())
+    said = ""
+    for step in steps_of(DOCS / "tutorials" / "temperature.md"):
+        if step.text.startswith("python "):
+            subprocess.run([sys.executable, *step.text.split()[1:]], cwd=reader.folder, check=True)
+        elif step.what == "bash":
+            reader.type(step.text)
+        elif step.what == "python":
+            command = [sys.executable, "-c", step.text]
+            said += subprocess.run(command, cwd=reader.folder, stdout=subprocess.PIPE, text=True, check=True).stdout
+    found = json.loads((reader.folder / "diagnosis" / "diagnosis.json").read_text())["axes"]["x"]
+    (effect,) = found["effects"]
+    assert (found["verdict"], effect["name"]) == ("named", "surroundings")
+    (quantity,) = effect["parameters"]["quantities"]
+    assert quantity["topic"] == "/room/temperature"
+    # Of `EXPANSION` in the script, m/K, as the page says.
+    assert quantity["offset_gain"] == pytest.approx(3e-7, rel=0.03)
+    assert json.loads((reader.folder / "verification" / "certificate.json").read_text())["verdict"] == "passed"
+    assert [float(line.split()[-2]) for line in said.splitlines()] == pytest.approx([6.0, 6.0], abs=3.0)

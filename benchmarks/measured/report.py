@@ -29,7 +29,7 @@ Rows = Mapping[str, Mapping[str, Mapping[str, Any]]]
 
 
 def readme_table(rows: Rows, manifest: Manifest, date: str, command: str) -> str:
-    """Return the table of README: a row for each judged part."""
+    """Return the table of README, a row for each judged part, after a summary."""
     judged = "judged (fitted parts: [manifest](benchmarks/measured/manifest.json))"
     lines = [
         f"| source | {judged} | {' | '.join(COLUMNS)} | best of the other methods |",
@@ -50,14 +50,16 @@ def readme_table(rows: Rows, manifest: Manifest, date: str, command: str) -> str
     ours = [[marks(row).get(column, "") for column in ("SLPI", "SLPI, causes")] for row in rows.values()]
     wins, near = sum("*" in found for found in ours), sum(any(found) for found in ours)
     count = max(len(row) for row in rows.values())
+    first = (
+        f"{_cost(rows)} Of {count} methods, SLPI with or without causes is the best in {wins} of {len(rows)} rows, and "
+        f"the best or within its 95 % interval of it in {near}."
+    )
     said = (
         f"Free-run rms error without its mean on parts that were not fitted, % of their range; {date}, `{command}`. "
         f"Bold: the best of the row, of all {count} methods; =: the best is within the 95 % interval of this one. "
-        f"SLPI, with or without causes, is best in {wins} of {len(rows)} rows, and best or within its interval of the "
-        f"best in {near}. {_cost(rows)} "
-        "[All methods, with intervals, offsets and times](docs/explanation/measured.md)."
+        "[All methods, with intervals, offsets, inverses and times](docs/explanation/measured.md)."
     )
-    return "\n".join([*lines, "", said])
+    return "\n".join([first, "", *lines, "", said])
 
 
 def _cost(rows: Rows) -> str:
@@ -69,8 +71,9 @@ def _cost(rows: Rows) -> str:
     ]
     fit, sample = (np.median([cell[key] for cell in ours]) for key in ("fit_seconds", "sample_microseconds"))
     return (
-        f"With causes, in the median of the rows, the error of PI is {gains[0]:.1f} times as large, that of PI with a "
-        f"lag {gains[1]:.1f} times; the fit takes {fit:.0f} s of a processor, a sample of a free run {sample:.1f} µs."
+        f"In the median of the rows, the error of the classical model PI is {gains[0]:.1f} times that of SLPI with "
+        f"causes, that of PI with a lag {gains[1]:.1f} times; the fit takes {fit:.0f} s of a "
+        f"processor, a sample of a free run {sample:.1f} µs."
     )
 
 

@@ -8,6 +8,7 @@ because an offset of the classical PI model says nothing about its loops.
 import argparse
 from dataclasses import replace
 
+import kept
 import numpy as np
 from numpy.typing import NDArray
 from paths import scan_path
@@ -76,9 +77,11 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--duration", type=float, default=60.0, help="seconds of calibration drive")
     parser.add_argument("--rate", type=float, default=200.0)
+    parser.add_argument("--keep", action="store_true", help=f"write the figures to {kept.KEPT.name}")
     options, _ = parser.parse_known_args()
     print(f"{options.duration:g} s of calibration, {NOISE * 1e9:g} nm noise, errors in % of stroke")
     print("seed   slpi mean    max     pi mean    max   ratio   after an excursion below reach (without it)")
+    columns = []
     for seed in range(options.seeds):
         record, low, high = calibrated(seed, options.duration, options.rate)
         margin = 0.02 * (high - low)
@@ -86,9 +89,18 @@ def main() -> None:
         models = {kind: slpi_ros.identify(record, kind) for kind in ("slpi", "pi")}
         found = {kind: errors(model, seed, low, high, 40.0, options.rate) for kind, model in models.items()}
         (a, b), (c, d) = ((100 * np.abs(e).mean(), 100 * np.abs(e).max()) for e in (found["slpi"], found["pi"]))
+        columns.append((a, b, c, d))
         ratio = smaller_ratio(found["slpi"], found["pi"])
         after, without = below_remanence(models["slpi"], seed, low - margin, high, options.rate)
         print(f"{seed:4d} {a:11.4f} {b:6.3f} {c:11.3f} {d:6.2f} {ratio:7.0f} {100 * after:14.4f} ({100 * without:.4f})")
+    if options.keep:
+        least, most = np.min(columns, axis=0), np.max(columns, axis=0)
+        what = f"simulated stages, {options.seeds} seeds: mean / maximum error on an unseen path; the same with PI"
+        spans = [
+            f"{low:.{digits}f}-{high:.{digits}f} %" for low, high, digits in zip(least, most, (3, 2, 2, 1), strict=True)
+        ]
+        said = [f"{spans[0]} / {spans[1]}", f"{spans[2]} / {spans[3]}"]
+        kept.write_row("accuracy", what, "; ".join(said), "make bench")
 
 
 if __name__ == "__main__":

@@ -20,6 +20,7 @@ from dataclasses import dataclass, replace
 from itertools import combinations
 from multiprocessing import get_context
 
+import kept
 import numpy as np
 from hidden import CONFUSABLE, NAMES, again, hide
 from hidden.unknown import KINDS, NEAR, hide_unknown
@@ -37,6 +38,14 @@ from slpi_ros.simulation.parameters import AxisParameters
 FloatArray = NDArray[np.float64]
 GROUPS = ("single", "pair", "simulator", "clean", "unknown")
 SAMPLES = 40_000
+# What the groups are, in README.
+MEANT = {
+    "single": "simulated stages with one hidden effect: that one named or among the alternatives, and no other",
+    "pair": "with two",
+    "simulator": "with creep and a lag, by the package's own simulator",
+    "clean": "with none",
+    "unknown": f"with one of {len(KINDS)} causes that no effect describes",
+}
 # Group "simulator": the simulated stage of the package and its default calibration drive (s, Hz), sensor noise (m), lag
 # (s), and smallest and largest creep per decade of time (share of the displacement).
 DURATION, RATE, NOISE, LAG, CREEP = 60.0, 500.0, 8e-9, 3e-3, (0.005, 0.03)
@@ -254,12 +263,20 @@ def main() -> None:
     parser.add_argument("--groups", nargs="+", choices=GROUPS, default=list(GROUPS))
     parser.add_argument("--only", help="cases with this effect or kind")
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--keep", action="store_true", help=f"write the figures to {kept.KEPT.name}")
     options = parser.parse_args()
     outcomes = []
     with get_context("spawn").Pool(options.processes, maxtasksperchild=20) as pool:
         for outcome in pool.imap_unordered(run, cases(options.groups, options.draws, options.seed, options.only)):
             print(outcome.line(), flush=True)
             outcomes.append(outcome)
+    if options.keep:
+        for group in options.groups:
+            own = [one for one in outcomes if one.case.group == group]
+            bad = sum(one.wrong or one.silent or bool(one.failure) for one in own)
+            said = f"{sum(one.right for one in own)} of {len(own)}; {bad} wrong or silent"
+            said = f"{bad} of {len(own)} wrong or silent" if group in ("clean", "unknown") else said
+            kept.write_row(f"confusion {group}", f"diagnosis, {MEANT[group]}", said, "make bench-confusion")
     table(sorted(outcomes, key=lambda one: (GROUPS.index(one.case.group), one.case.hidden, one.case.seed)))
 
 

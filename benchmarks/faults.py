@@ -28,6 +28,7 @@ from scipy.io import savemat
 sys.path.append(str(Path(__file__).resolve().parents[1]))
 sys.path.append(str(Path(__file__).resolve().parents[1] / "test"))
 
+from benchmarks import kept
 from benchmarks.node_lives import AXES, MS, START_NS, Twin, lives, mutated, stage
 from slpi_ros.compensator.persistence import SavedAxis, SavedMemory, load_memory, model_id, save_memory
 from slpi_ros.errors import SlpiError
@@ -282,6 +283,7 @@ def main() -> int:
     parser.add_argument("--hours", type=float, default=24.0, help="simulated hours of one life; default: 24")
     parser.add_argument("--rate", type=float, default=50.0, help="samples a second of that life; default: 50")
     parser.add_argument("--seed", type=int, default=int(time.time()), help="default: the time")
+    parser.add_argument("--keep", action="store_true", help=f"write the figures to {kept.KEPT.name}")
     options = parser.parse_args()
     # A shell starts background jobs with SIGINT ignored, and a node inherits that until its own handler is there.
     signal.signal(signal.SIGINT, signal.default_int_handler)
@@ -297,6 +299,15 @@ def main() -> int:
         from benchmarks.feedback_soak import soak
 
         rows += soak(options.soak, options.seed)
+    if options.keep:
+        total = sum((counts for name, counts in rows if not name.startswith(" ")), Counter[str]())
+        what = (
+            "damaged input and bad luck (mutated bags, models and messages; lives of a compensator with full disks, "
+            "clock jumps and `kill -9`; a simulated day): cases; refused; wrong, such as a traceback, a hang or a "
+            "voltage outside of a limit"
+        )
+        said = f"{total['tried']:,}; {total['refused']:,}; {total['wrong']}"
+        kept.write_row("faults", what, said, "make bench-faults")
     return 1 if table(rows) else 0
 
 

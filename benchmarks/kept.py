@@ -1,4 +1,7 @@
-"""The file of kept figures: a section for each command, with its date, the versions it ran with, and its figures."""
+"""The file of kept figures: a section for each command, with its date, the versions it ran with, and its figures.
+
+The section `ROWS` holds the rows of README's table, each with the command that printed its figures, and the date.
+"""
 
 import json
 import platform
@@ -8,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 KEPT = Path(__file__).with_name("kept_figures.json")
+ROWS = "rows"
 PACKAGES = ("numba", "numpy", "osqp", "scipy")
 
 
@@ -22,10 +26,17 @@ def read(section: str, path: Path = KEPT) -> dict[str, Any]:
 def write(section: str, command: str, figures: Any, path: Path = KEPT) -> None:
     """Replace the figures of a section; the others stay as they are."""
     document = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    document[section] = {
-        "date": datetime.now(UTC).date().isoformat(),
-        "command": command,
-        "versions": {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}},
-        "figures": figures,
-    }
+    document[section] = {**_when(command), "figures": figures}
     path.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def write_row(key: str, what: str, measured: str, command: str, path: Path = KEPT) -> None:
+    """Replace a row of README's table: what was measured, the figures as text, and the command that prints them."""
+    document = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+    document.setdefault(ROWS, {})[key] = {"what": what, "measured": measured, **_when(command)}
+    path.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+
+
+def _when(command: str) -> dict[str, Any]:
+    versions = {"python": platform.python_version(), **{name: version(name) for name in PACKAGES}}
+    return {"date": datetime.now(UTC).date().isoformat(), "command": command, "versions": versions}

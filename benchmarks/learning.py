@@ -24,9 +24,12 @@ import math
 import sys
 import time
 import warnings
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
+import kept
 import numpy as np
 from hidden import foreign
 from numpy.typing import NDArray
@@ -271,6 +274,19 @@ def compare(
     return errors
 
 
+def keep(specimen: Specimen, seed: int, passes: int, errors: Mapping[str, Any]) -> None:
+    """Write the row of README on paths that repeat."""
+    what = (
+        f"a path that repeats, on a simulated stage of another physics ({specimen.kind}, a mode of "
+        f"{specimen.frequency:.0f} Hz with a damping of {specimen.damping:.3f}, {1e9 * specimen.noise:.1f} nm of "
+        f"sensor noise): true error on a raster of 20 Hz with the inverse alone; with PI feedback; after {passes} passes "
+        "of learning through a straight line; of `learn`"
+    )
+    figures = errors["learner"][0], errors["PI"][-1], errors["line"][-1], errors["learner"][-1]
+    said = "; ".join(f"{one:.1f} nm" for one in figures)
+    kept.write_row("learning", what, said, f'make bench-learning LEARNING="--seed {seed} --count 1"')
+
+
 def main() -> int:
     """Print a row for each stage and path, and what share keeps the marks; return 1 if one is missed."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
@@ -282,6 +298,7 @@ def main() -> int:
     parser.add_argument("--alone", action="store_true", help="the learner alone")
     parser.add_argument("--models", type=Path, help="folder in which identified models are kept")
     parser.add_argument("-v", action="store_true", help="tell what happened in which pass")
+    parser.add_argument("--keep", action="store_true", help=f"write the row of the first raster 20 to {kept.KEPT.name}")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     print(f"true error, rms nm, without mean; after 5 and {options.passes} passes")
@@ -314,6 +331,8 @@ def main() -> int:
                 counts["HARM (alone too)"] += 1
                 marks.append("(alone too)")
             rows += 1
+            if options.keep and name == "raster 20" and seed == options.seed:
+                keep(specimen, seed, options.passes, errors)
             fifth = f"{line[min(5, len(line) - 1)]:>8.1f}{line[-1]:>8.1f}" if line else f"{'':>16}"
             print(f"{'':<34}{name:<12}{noise:>6.1f}{own[0]:>8.1f}{errors.get('PI', [math.nan])[-1]:>8.1f}{fifth}"
                   f"{own[min(5, len(own) - 1)]:>10.1f}{own[-1]:>8.1f}  {errors['limited'][0]}"

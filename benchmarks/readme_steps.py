@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import kept
 import numpy as np
 import rclpy
 import yaml
@@ -263,18 +264,21 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3, 4, 5])
     parser.add_argument("--moved", action="store_true", help="also stages that were moved after the record")
+    parser.add_argument("--keep", action="store_true", help=f"write the figures to {kept.KEPT.name}")
     options = parser.parse_args()
     # On this machine only, and in a separate ROS domain.
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ.setdefault("ROS_DOMAIN_ID", str(60 + os.getpid() % 40))
     rclpy.init()
     print("errors at five set points, % of stroke: as written, without reset | next day, with reset_on_start")
+    found: list[FloatArray] = []
     for seed in options.seeds:
         with tempfile.TemporaryDirectory() as folder:
             user = Readme(Path(folder))
             try:
                 model, errors, warnings = as_written(user, seed)
                 again, more = next_day(user, seed, model)
+                found += [errors, again]
                 print(f"seed {seed}: {shown(errors)} | {shown(again)}; warnings {len(warnings)} | {len(more)}")
                 for line in [*warnings, *more]:
                     print(f"    {line}")
@@ -284,6 +288,12 @@ def main() -> None:
             finally:
                 user.close()
     rclpy.shutdown()
+    if options.keep:
+        largest = float(np.abs(found).max())
+        what = (
+            f"the commands of this page on {len(options.seeds)} simulated stages, that day and the next: largest error"
+        )
+        kept.write_row("readme", what, f"{largest:.3f} % of stroke", "make bench-readme")
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+from benchmarks import kept
 from benchmarks.episodes import Ratios, run
 
 CHUNK = 50
@@ -231,6 +232,7 @@ def main() -> int:
     parser.add_argument("--episodes", type=int, default=10_000)
     parser.add_argument("--lives", type=int, default=100)
     parser.add_argument("--seed", type=int, default=None, help="default: drawn from the clock")
+    parser.add_argument("--keep", action="store_true", help=f"write the figures to {kept.KEPT.name}")
     options = parser.parse_args()
     first = int(time.time()) % 10**7 * 10 if options.seed is None else options.seed
     print(
@@ -244,6 +246,14 @@ def main() -> int:
             ratios = of(count, first)
             print(line(name, count, first, ratios), flush=True)
             worst.add(ratios)
+    if options.keep:
+        ratio = max(worst.step, worst.slew, worst.acceleration, worst.start)
+        what = (
+            f"what the amplifier feels, {worst.outputs:,} voltages of {options.episodes:,} random episodes and "
+            f"{options.lives} lives of real processes: largest ratio to a limit of step, slew, acceleration and first "
+            "step; volts outside of the limits"
+        )
+        kept.write_row("steps", what, f"{ratio:.3f}; {max(worst.outside, 0.0):.3g}", "make bench-steps")
     wrong = max(worst.step, worst.slew, worst.acceleration, worst.start) > 1.0 + 1e-6 or worst.outside > 0.0
     if wrong:
         print("above 1:", {name: what for name, what in worst.what.items() if getattr(worst, name) > 1.0 + 1e-6})

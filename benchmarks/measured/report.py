@@ -110,6 +110,13 @@ def latency_line(section: Mapping[str, Any]) -> str:
     )
 
 
+def rows_table(rows: Mapping[str, Mapping[str, str]]) -> str:
+    """Return the table of README on all other figures: a row for each that is kept."""
+    lines = ["| what | measured | command | date |", "|---|---|---|---|"]
+    lines += [f"| {row['what']} | {row['measured']} | `{row['command']}` | {row['date']} |" for row in rows.values()]
+    return "\n".join(lines)
+
+
 def _cell(cell: Mapping[str, Any], mark: str) -> str:
     if "rms" not in cell:
         return "refused"
@@ -132,6 +139,7 @@ def pages() -> dict[Path, str]:
     rows, date, command = section["figures"], section["date"], section["command"]
     readme = with_part(README.read_text("utf-8"), "measured", readme_table(rows, read_manifest(), date, command))
     readme = with_part(readme, "latency", latency_line(latency))
+    readme = with_part(readme, "rows", rows_table(kept.read(kept.ROWS)))
     return {README: readme, PAGE: with_part(PAGE.read_text("utf-8"), "measured", full_tables(rows, date, command))}
 
 

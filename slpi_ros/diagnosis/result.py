@@ -340,7 +340,7 @@ def _in_model(now: Explanation, effects: Sequence[NamedEffect], dropped: Sequenc
             "rates of these records only."
         )
     if dropped:
-        said += f" Dropped, as what is gained does not hold elsewhere: {', '.join(dropped)}."
+        said += f" Dropped, as they leave too much or as what they gain does not hold elsewhere: {', '.join(dropped)}."
     return said
 
 

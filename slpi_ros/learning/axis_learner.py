@@ -121,9 +121,9 @@ class AxisLearner:
         self._since = 0
         self._dwell: int | None = None
         # Harmonics near an identified mode that rings from pass to pass, passes until it has settled, and passes since
-        # these harmonics were changed.
+        # these harmonics were changed: the first pass comes from rest.
         self._ringing = np.zeros(self.frequency.size, dtype=np.bool_)
-        self._ring_dwell, self._ring_since = 1, MOST_DWELL
+        self._ring_dwell, self._ring_since = 1, 0
         slowest = 0.0
         for hertz, seconds in ringing(axis):
             slowest = max(slowest, ONSET_PERIODS / hertz)
@@ -466,6 +466,7 @@ class AxisLearner:
                 "without_variance_m2": h.without_variance.tolist() if h.passes else [],
                 "covariance_m": _pairs(h.covariance),
                 "noise_m2": h.noise.tolist(),
+                "answered_m": _pairs(h.answered),
                 "passes": h.passes,
             },
             "passes": [asdict(one) for one in self.passes],
@@ -506,6 +507,7 @@ class AxisLearner:
             without_variance=np.array(numbers["without_variance_m2"]) if numbers["passes"] else h.without_variance,
             covariance=_complex(numbers["covariance_m"]),
             noise=np.array(numbers["noise_m2"]),
+            answered=_complex(numbers["answered_m"]),
             passes=numbers["passes"],
         )
 

@@ -12,11 +12,12 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.learning.harmonics import ComplexArray
 from slpi_ros.model.axis_model import AxisModel
 
-# Relative standard deviation of a gain at low frequencies, and the frequency (Hz) where it has grown by 1: mechanics
-# that no effect describes.
-DOUBT, DOUBT_HZ = 0.05, 150.0
+# Relative standard deviation of a gain at low frequencies. It grows with the square of the frequency, by 1 at that of a
+# mode that no effect describes: this (Hz), or an octave above the lowest identified mode, which another below would
+# have been identified with.
+DOUBT, DOUBT_HZ, OCTAVE = 0.05, 150.0, 2.0
 # Standard errors of an effect's parameter by which it may be wrong, and the least relative one.
-STANDARD_ERRORS, LEAST_RELATIVE = 2.0, 0.02
+STANDARD_ERRORS, LEAST_RELATIVE = 2.0, 0.005
 # Samples of the test signal, its repetitions until it has settled, and its amplitude as a share of the stroke.
 SAMPLES, REPEATED, AMPLITUDE = 2048, 3, 1e-3
 # Frequency (Hz) from which the test signal falls with the square of the frequency, as paths do: the inverse of a mode
@@ -43,7 +44,8 @@ def first_guess(axis: AxisModel, dt: float, frequency: FloatArray) -> tuple[Comp
     variance : ndarray, shape (K,)
     """
     plain = np.ones(frequency.size, dtype=np.complex128)
-    variance = (DOUBT + frequency / DOUBT_HZ) ** 2
+    unknown = max(DOUBT_HZ, OCTAVE * min((hertz for hertz, _ in ringing(axis)), default=0.0))
+    variance = (DOUBT + (frequency / unknown) ** 2) ** 2
     stage = axis.stage_only
     if not stage.effects:
         return plain, variance

@@ -202,6 +202,9 @@ class AxisLearner:
         if self._previous is not None and not change.any():
             # The same path again: the same reading, but for what is still settling.
             expected, power = self._previous, 2.0 * self.noise**2
+            if not self._still:
+                # A mode that begins to ring may change as much as the error.
+                power += error**2
         judged = judge(seen, expected, math.sqrt(power), floor, self._deviating, error)
         if self._lead_in is not None and not judged.reason:
             judged = agreed(self._lead_in, judged, self.desired, floor)

@@ -310,6 +310,10 @@ class AxisLearner:
 
     def _step(self) -> None:
         harmonics = self.harmonics.step(self._spectrum(self.correction), self.wanted, self.gain) * self._due
+        error = np.abs(self.left) ** 2
+        taken = self._power(error - np.abs(self.left - self.harmonics.gain * harmonics) ** 2)
+        added = self._power(self.harmonics.scatter * float(np.mean(np.abs(harmonics[1:]) ** 2)))
+        harmonics = harmonics * (taken / max(taken + added, 1e-300) if taken > 0.0 else 1.0)
         if harmonics[self._ringing].any():
             self._ring_since = 0
         step = self._signal(harmonics) * self.taper
@@ -477,6 +481,7 @@ class AxisLearner:
                 "covariance_m": _pairs(h.covariance),
                 "noise_m2": h.noise.tolist(),
                 "answered_m": _pairs(h.answered),
+                "scatter": h.scatter.tolist(),
                 "passes": h.passes,
             },
             "passes": [asdict(one) for one in self.passes],
@@ -519,6 +524,7 @@ class AxisLearner:
             covariance=_complex(numbers["covariance_m"]),
             noise=np.array(numbers["noise_m2"]),
             answered=_complex(numbers["answered_m"]),
+            scatter=np.array(numbers["scatter"]),
             passes=numbers["passes"],
         )
 

@@ -23,6 +23,8 @@ REST_SHARE, TURN_SHARE = 0.1, 0.02
 LEAST_VARIANCE, GAIN_WALK, ERROR_WALK = 1e-8, 1e-4, 0.02
 # Share of an unexpected change, as in the neighbouring harmonics, that is taken for a change of the repeating error.
 CHANGED_SHARE, NEIGHBOURS = 0.2, 3
+# Share of the new estimate of what comes with a change of the path.
+SCATTER_SHARE = 0.3
 # A share of the noise's new estimate in each pass, of one harmonic and (by this number of harmonics) of the floor.
 NOISE_SHARE, FLOOR_COUNT = 0.1, 200.0
 
@@ -48,6 +50,9 @@ class Harmonics:
         Variance of ``n``.
     answered : ndarray of complex, metres
         Correction in the pass that was learned from last.
+    scatter : ndarray
+        Variance that comes with a change of the path and goes by no gain, as the hysteresis is that of another path: a
+        multiple of the mean square of the change's harmonics.
     passes : int
         Number of passes that the estimates come from.
 
@@ -66,13 +71,14 @@ class Harmonics:
     covariance: ComplexArray
     noise: FloatArray
     answered: ComplexArray
+    scatter: FloatArray
     passes: int = 0
 
     @classmethod
     def first(cls, gain: ComplexArray, variance: FloatArray, noise: FloatArray) -> "Harmonics":
         """Return what is known before the first pass: the first guess of the gains, and the sensor's noise."""
         none = np.zeros_like(gain)
-        return cls(gain, none, variance, np.full(variance.size, np.inf), none, noise, none)
+        return cls(gain, none, variance, np.full(variance.size, np.inf), none, noise, none, np.zeros_like(noise))
 
     def expected(self, correction: ComplexArray) -> ComplexArray:
         """Return the expected reading, (K,), metres, of a pass with a correction (m)."""
@@ -136,7 +142,14 @@ class Harmonics:
         # The hysteresis of the corrected path is another one.
         moved = self._of_hysteresis(correction - self.answered)
         before = self.variance(correction) + moved + self.noise
-        changed = CHANGED_SHARE * np.maximum(_around(np.abs(unexpected) ** 2) - before, 0.0) + ERROR_WALK * self.noise
+        beyond = np.maximum(_around(np.abs(unexpected) ** 2) - before, 0.0)
+        scattered, size = self.scatter, float(np.mean(np.abs(correction - self.answered)[1:] ** 2))
+        scatter = scattered * size
+        if size > 0.0:
+            new = beyond / (size + float(np.mean(self.noise[1:])))
+            scattered = np.where(due, scattered + SCATTER_SHARE * (new - scattered), scattered)
+        moved, before = moved + scatter, before + scatter
+        changed = CHANGED_SHARE * np.maximum(beyond - scatter, 0.0) + ERROR_WALK * self.noise
         a, b = self.gain_variance + GAIN_WALK, self.without_variance + changed + moved
         with_gain = a * correction.conj() + self.covariance
         with_rest = self.covariance.conj() * correction.conj() + b
@@ -153,6 +166,7 @@ class Harmonics:
             covariance=np.where(due, self.covariance - k_gain * k_rest.conj() * total, self.covariance),
             noise=np.where(due, self._noise_after(np.abs(unexpected) ** 2, before), self.noise),
             answered=np.where(due, correction, self.answered),
+            scatter=scattered,
             passes=self.passes + 1,
         )
 

@@ -14,8 +14,9 @@ from slpi_ros.model.axis_model import AxisModel
 
 # Relative standard deviation of a gain at low frequencies. It grows with the square of the frequency, by 1 at that of a
 # mode that no effect describes: this (Hz), or an octave above the lowest identified mode, which another below would
-# have been identified with.
-DOUBT, DOUBT_HZ, OCTAVE = 0.05, 150.0, 2.0
+# have been identified with. Beyond, it is at most the rms gain of a mode of 2 % damping that may be anywhere within a
+# decade: sqrt(pi / (4 x 0.02) / log(10)).
+DOUBT, DOUBT_HZ, OCTAVE, MOST_DOUBT = 0.05, 150.0, 2.0, 4.0
 # Standard errors of an effect's parameter by which it may be wrong, and the least relative one.
 STANDARD_ERRORS, LEAST_RELATIVE = 2.0, 0.005
 # Samples of the test signal, its repetitions until it has settled, and its amplitude as a share of the stroke.
@@ -45,7 +46,7 @@ def first_guess(axis: AxisModel, dt: float, frequency: FloatArray) -> tuple[Comp
     """
     plain = np.ones(frequency.size, dtype=np.complex128)
     unknown = max(DOUBT_HZ, OCTAVE * min((hertz for hertz, _ in ringing(axis)), default=0.0))
-    variance = (DOUBT + (frequency / unknown) ** 2) ** 2
+    variance = np.minimum(DOUBT + (frequency / unknown) ** 2, MOST_DOUBT) ** 2
     stage = axis.stage_only
     if not stage.effects:
         return plain, variance

@@ -12,8 +12,8 @@ ComplexArray = NDArray[np.complex128]
 # A phase counts as known where two standard deviations of the gain are within 45 degrees: sqrt(2 P) <= sin(45) |G|.
 PHASE_KNOWN = 0.5
 # Largest response to a test step of a harmonic whose phase is not known, as a share of its error, and the number of
-# standard deviations that its error must have.
-TEST_SHARE, TEST_ABOVE = 0.1, 3.0
+# standard deviations that its error must have. With a phase of its own each, they add 2 % to the rms error.
+TEST_SHARE, TEST_ABOVE = 0.2, 3.0
 # Least gain by which an error is divided: a mode that the inverse takes out may leave next to nothing.
 LEAST_GAIN = 0.2
 # Standard deviation of what is left of the hysteresis, as a share of the path's harmonics nearby.
@@ -186,7 +186,7 @@ class Harmonics:
 
         The estimated error is divided by the gain where the phase is known to 45 degrees, less where the gain is
         uncertain (``conj(G) / (|G|^2 + P)``), and not by what may be noise. Elsewhere a test step is made whose answer
-        is at most a tenth of the error, or of the size of the noise: from it the gain is learned.
+        is at most a fifth of the error, or of the size of the noise: from it the gain is learned.
         """
         error = desired - self.expected(correction)
         size, variance = np.abs(error), self.variance(correction)

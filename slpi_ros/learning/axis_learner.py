@@ -44,7 +44,7 @@ ANSWER = 5.0
 # A change has settled where a pass differs from the one before by this share of what it has changed; most passes that
 # are waited for. Before that, a pass that is so much worse than the best leads back at once.
 SETTLED, MOST_DWELL, AT_ONCE = 0.2, 6, 1.5
-# What settles within the passes that are waited for falls to less than this share (of its square) from each to the next.
+# What settles within the passes that are waited for falls to less than this share, in power, from each to the next.
 FALLING = 0.7
 # A change of a path that closes comes in without a jump, which an identified mode would answer to: over this many of
 # its periods, and at most this share of the pass.

@@ -53,8 +53,8 @@ RECORDS_S = (4.0, 0.6)
 LINE = [(gain, band) for gain in (0.3, 0.6, 1.0) for band in (40.0, 100.0, 250.0)]
 PI = [(p, i) for p in (0.0, 0.2) for i in (20.0, 80.0, 250.0)]
 PATHS = ("raster 1", "raster 5", "raster 20", "raster 40", "raster f/10", "sine", "steps", "free")
-# Share of the stroke that a path covers.
-SHARE = 0.6
+# Share of the stroke that a path covers, and by what it is made smaller where the voltages would not leave room.
+SHARE, SMALLER, ROOM = 0.6, 0.8, 0.05
 
 
 @dataclass(frozen=True)
@@ -150,9 +150,25 @@ def identified(specimen: Specimen, kept: Path | None) -> slpi_ros.StageModel:
 
 
 def path_of(name: str, specimen: Specimen, axis: slpi_ros.AxisModel) -> FloatArray:
-    """Return one pass (m, (N,)) of a path, within the range of the stage."""
+    """Return one pass (m, (N,)) of a path, within the range of the stage and of its voltages."""
+    share = SHARE
+    while not _within(path := _path_of(name, specimen, axis, share), axis):
+        share *= SMALLER
+    return path
+
+
+def _within(path: FloatArray, axis: slpi_ros.AxisModel) -> bool:
+    """Return whether the voltages of the inverse leave a share of their range for a correction."""
+    lead = np.linspace(axis.start.displacement, path[0], round(0.5 * RATE_HZ))
+    asked = np.concatenate([lead, path, path])
+    v = axis.stream(start_memory="start").run(np.arange(asked.size) / RATE_HZ, asked)[0][lead.size :]
+    low, high = axis.voltage_range
+    return bool(v.min() > low + ROOM * (high - low) and v.max() < high - ROOM * (high - low))
+
+
+def _path_of(name: str, specimen: Specimen, axis: slpi_ros.AxisModel, share: float) -> FloatArray:
     low, high = axis.displacement_range
-    middle, half = 0.5 * (low + high), 0.5 * SHARE * (high - low)
+    middle, half = 0.5 * (low + high), 0.5 * share * (high - low)
     if name == "steps":
         edges = np.repeat([0.0, 0.6, -0.4, 0.9, -0.8, 0.0], round(0.08 * RATE_HZ))
         return middle + half * np.convolve(np.pad(edges, 40, "wrap"), np.hanning(81) / np.hanning(81).sum(), "valid")

@@ -44,6 +44,8 @@ ANSWER = 5.0
 # A change has settled where a pass differs from the one before by this share of what it has changed; most passes that
 # are waited for. Before that, a pass that is so much worse than the best leads back at once.
 SETTLED, MOST_DWELL, AT_ONCE = 0.2, 6, 1.5
+# What settles within the passes that are waited for falls to less than this share, in power, from each to the next.
+FALLING = 0.7
 # A change of a path that closes comes in without a jump, which an identified mode would answer to: over this many of
 # its periods, and at most this share of the pass.
 ONSET_PERIODS, ONSET = 5.0, 0.25
@@ -120,10 +122,11 @@ class AxisLearner:
         self._changed: FloatArray | None = None
         self._since = 0
         self._dwell: int | None = None
+        self._moved = math.inf  # m^2, mean square difference of the last two passes
         # Harmonics near an identified mode that rings from pass to pass, passes until it has settled, and passes since
-        # these harmonics were changed.
+        # these harmonics were changed: the first pass comes from rest.
         self._ringing = np.zeros(self.frequency.size, dtype=np.bool_)
-        self._ring_dwell, self._ring_since = 1, MOST_DWELL
+        self._ring_dwell, self._ring_since = 1, 0
         slowest = 0.0
         for hertz, seconds in ringing(axis):
             slowest = max(slowest, ONSET_PERIODS / hertz)
@@ -202,6 +205,9 @@ class AxisLearner:
         if self._previous is not None and not change.any():
             # The same path again: the same reading, but for what is still settling.
             expected, power = self._previous, 2.0 * self.noise**2
+            if not self._still or self._dwell is None or self._since < self._dwell:
+                # What is settling, and a mode that begins to ring, may change as much as the error.
+                power += error**2
         judged = judge(seen, expected, math.sqrt(power), floor, self._deviating, error)
         if self._lead_in is not None and not judged.reason:
             judged = agreed(self._lead_in, judged, self.desired, floor)
@@ -228,7 +234,7 @@ class AxisLearner:
         self._told, self.refused = "", 0
         if self._lead_in is None and not self.passes:
             # The first pass comes from rest, and nothing was there to compare it with: no step is made for it.
-            self._lead_in = clean
+            self._lead_in, self._deviating = clean, judged.deviating
             self._told = "the first pass: compared with the next"
             return
         lead_in, self._lead_in = self._lead_in, None
@@ -285,7 +291,7 @@ class AxisLearner:
         The first change of the path is followed until a pass is like the one before; later ones as many passes.
         """
         if (self.correction != self._aimed).any():
-            self._since, self._changed = 0, self._previous
+            self._since, self._changed, self._moved = 0, self._previous, math.inf
         self._since, before = self._since + 1, self._previous
         self._previous = clean
         if self._changed is None or before is None:
@@ -295,12 +301,19 @@ class AxisLearner:
                 self._power(np.abs(self._spectrum(clean - other)) ** 2 * ~self._ringing)
                 for other in (before, self._changed)
             )
-            if moved < max(SETTLED**2 * answered, 4.0 * self.noise**2) or self._since > MOST_DWELL:
+            settled = moved < max(SETTLED**2 * answered, 4.0 * self.noise**2) or self._since > MOST_DWELL
+            # What differs as much as between the passes before does not settle: it does not repeat.
+            if settled or moved > FALLING * self._moved:
                 self._dwell = self._since - 1
+            self._moved = moved
         return self._dwell is not None and self._since >= self._dwell
 
     def _step(self) -> None:
         harmonics = self.harmonics.step(self._spectrum(self.correction), self.wanted, self.gain) * self._due
+        error = np.abs(self.left) ** 2
+        taken = self._power(error - np.abs(self.left - self.harmonics.gain * harmonics) ** 2)
+        added = self._power(self.harmonics.scatter * float(np.mean(np.abs(harmonics[1:]) ** 2)))
+        harmonics = harmonics * (taken / max(taken + added, 1e-300) if taken > 0.0 else 1.0)
         if harmonics[self._ringing].any():
             self._ring_since = 0
         step = self._signal(harmonics) * self.taper
@@ -443,6 +456,7 @@ class AxisLearner:
             "since": self._since,
             "ring_since": self._ring_since,
             "dwell": self._dwell,
+            "moved_m2": self._moved if math.isfinite(self._moved) else None,
             "returned": self._returned,
             "record_m2": self.record if math.isfinite(self.record) else None,
             "learn_limit_m": self.limit,
@@ -466,6 +480,8 @@ class AxisLearner:
                 "without_variance_m2": h.without_variance.tolist() if h.passes else [],
                 "covariance_m": _pairs(h.covariance),
                 "noise_m2": h.noise.tolist(),
+                "answered_m": _pairs(h.answered),
+                "scatter": h.scatter.tolist(),
                 "passes": h.passes,
             },
             "passes": [asdict(one) for one in self.passes],
@@ -488,6 +504,7 @@ class AxisLearner:
         self._lead_in, self._since = _array(document["lead_in_m"]), document["since"]
         self._ring_since = document["ring_since"]
         self._dwell, self._returned = document["dwell"], document["returned"]
+        self._moved = math.inf if document["moved_m2"] is None else document["moved_m2"]
         self.record = math.inf if document["record_m2"] is None else document["record_m2"]
         self.gain, self.held = document["gain"], document["held"]
         self.returns, self.refused, self._offset = document["returns"], document["refused"], document["offset_m"]
@@ -506,6 +523,8 @@ class AxisLearner:
             without_variance=np.array(numbers["without_variance_m2"]) if numbers["passes"] else h.without_variance,
             covariance=_complex(numbers["covariance_m"]),
             noise=np.array(numbers["noise_m2"]),
+            answered=_complex(numbers["answered_m"]),
+            scatter=np.array(numbers["scatter"]),
             passes=numbers["passes"],
         )
 

@@ -12,13 +12,18 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.learning.harmonics import ComplexArray
 from slpi_ros.model.axis_model import AxisModel
 
-# Relative standard deviation of a gain at low frequencies, and the frequency (Hz) where it has grown by 1: mechanics
-# that no effect describes.
-DOUBT, DOUBT_HZ = 0.05, 150.0
+# Relative standard deviation of a gain at low frequencies. It grows with the square of the frequency, by 1 at that of a
+# mode that no effect describes: this (Hz), or an octave above the lowest identified mode, which another below would
+# have been identified with. Beyond, it is at most the rms gain of a mode of 2 % damping that may be anywhere within a
+# decade: sqrt(pi / (4 x 0.02) / log(10)).
+DOUBT, DOUBT_HZ, OCTAVE, MOST_DOUBT = 0.05, 150.0, 2.0, 4.0
 # Standard errors of an effect's parameter by which it may be wrong, and the least relative one.
-STANDARD_ERRORS, LEAST_RELATIVE = 2.0, 0.02
+STANDARD_ERRORS, LEAST_RELATIVE = 2.0, 0.005
 # Samples of the test signal, its repetitions until it has settled, and its amplitude as a share of the stroke.
 SAMPLES, REPEATED, AMPLITUDE = 2048, 3, 1e-3
+# Frequency (Hz) from which the test signal falls with the square of the frequency, as paths do: the inverse of a mode
+# makes voltages of high frequencies so large that hysteresis answers to them at all others.
+FALLING_HZ = 100.0
 
 
 def first_guess(axis: AxisModel, dt: float, frequency: FloatArray) -> tuple[ComplexArray, FloatArray]:
@@ -40,7 +45,8 @@ def first_guess(axis: AxisModel, dt: float, frequency: FloatArray) -> tuple[Comp
     variance : ndarray, shape (K,)
     """
     plain = np.ones(frequency.size, dtype=np.complex128)
-    variance = (DOUBT + frequency / DOUBT_HZ) ** 2
+    unknown = max(DOUBT_HZ, OCTAVE * min((hertz for hertz, _ in ringing(axis)), default=0.0))
+    variance = np.minimum(DOUBT + (frequency / unknown) ** 2, MOST_DOUBT) ** 2
     stage = axis.stage_only
     if not stage.effects:
         return plain, variance
@@ -69,7 +75,9 @@ class _Test:
         low, high = stage.displacement_range
         phases = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi, SAMPLES // 2 + 1)
         phases[[0, -1]] = 0.0
-        signal = np.fft.irfft(np.exp(1j * phases) * (np.arange(phases.size) > 0), SAMPLES)
+        size = 1.0 / (1.0 + (np.fft.rfftfreq(SAMPLES, dt) / FALLING_HZ) ** 2)
+        size[0] = 0.0
+        signal = np.fft.irfft(np.exp(1j * phases) * size, SAMPLES)
         signal *= AMPLITUDE * (high - low) / np.abs(signal).max()
         self._signal = np.fft.rfft(signal)
         self._signal[0] = 1.0

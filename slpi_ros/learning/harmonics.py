@@ -12,8 +12,8 @@ ComplexArray = NDArray[np.complex128]
 # A phase counts as known where two standard deviations of the gain are within 45 degrees: sqrt(2 P) <= sin(45) |G|.
 PHASE_KNOWN = 0.5
 # Largest response to a test step of a harmonic whose phase is not known, as a share of its error, and the number of
-# standard deviations that its error must have.
-TEST_SHARE, TEST_ABOVE = 0.1, 3.0
+# standard deviations that its error must have. With a phase of its own each, they add 2 % to the rms error.
+TEST_SHARE, TEST_ABOVE = 0.2, 3.0
 # Least gain by which an error is divided: a mode that the inverse takes out may leave next to nothing.
 LEAST_GAIN = 0.2
 # Standard deviation of what is left of the hysteresis, as a share of the path's harmonics nearby.
@@ -23,6 +23,8 @@ REST_SHARE, TURN_SHARE = 0.1, 0.02
 LEAST_VARIANCE, GAIN_WALK, ERROR_WALK = 1e-8, 1e-4, 0.02
 # Share of an unexpected change, as in the neighbouring harmonics, that is taken for a change of the repeating error.
 CHANGED_SHARE, NEIGHBOURS = 0.2, 3
+# Share of the new estimate of what comes with a change of the path.
+SCATTER_SHARE = 0.3
 # A share of the noise's new estimate in each pass, of one harmonic and (by this number of harmonics) of the floor.
 NOISE_SHARE, FLOOR_COUNT = 0.1, 200.0
 
@@ -46,6 +48,11 @@ class Harmonics:
         Their covariance matrix: that of ``G`` and ``conj(d)`` is `covariance`.
     noise : ndarray, metres squared
         Variance of ``n``.
+    answered : ndarray of complex, metres
+        Correction in the pass that was learned from last.
+    scatter : ndarray
+        Variance that comes with a change of the path and goes by no gain, as the hysteresis is that of another path: a
+        multiple of the mean square of the change's harmonics.
     passes : int
         Number of passes that the estimates come from.
 
@@ -63,13 +70,15 @@ class Harmonics:
     without_variance: FloatArray
     covariance: ComplexArray
     noise: FloatArray
+    answered: ComplexArray
+    scatter: FloatArray
     passes: int = 0
 
     @classmethod
     def first(cls, gain: ComplexArray, variance: FloatArray, noise: FloatArray) -> "Harmonics":
         """Return what is known before the first pass: the first guess of the gains, and the sensor's noise."""
         none = np.zeros_like(gain)
-        return cls(gain, none, variance, np.full(variance.size, np.inf), none, noise)
+        return cls(gain, none, variance, np.full(variance.size, np.inf), none, noise, none, np.zeros_like(noise))
 
     def expected(self, correction: ComplexArray) -> ComplexArray:
         """Return the expected reading, (K,), metres, of a pass with a correction (m)."""
@@ -89,14 +98,10 @@ class Harmonics:
     def begun(self, desired: ComplexArray, reading: ComplexArray, before: ComplexArray) -> "Harmonics":
         """Return what is known after the first two passes, with no correction: desired, and measured last and before.
 
-        All are of shape (K,), metres. What is left of the hysteresis is taken for a share of the path's own harmonics
-        nearby, and of lower ones where it falls with the square of the frequency, as turns make it: where the path has
-        more power than that, and than what differs between the passes, the gain is known already.
+        All are of shape (K,), metres. Where the path has more power than what is left of its hysteresis, and than what
+        differs between the passes, the gain is known already.
         """
-        squared = np.arange(1.0, desired.size) ** 2
-        turning = np.append(0.0, np.maximum.accumulate(np.abs(desired[1:]) * squared) / squared)
-        rest = REST_SHARE**2 * _around(np.abs(desired) ** 2) + TURN_SHARE**2 * turning**2
-        rest = rest + _around(np.abs(reading - before) ** 2)
+        rest = self._of_hysteresis(desired) + _around(np.abs(reading - before) ** 2)
         total = self.gain_variance * np.abs(desired) ** 2 + rest + self.noise
         k_gain = self.gain_variance * desired.conj() / np.maximum(total, 1e-300)
         gain = self.gain + k_gain * (reading - self.gain * desired)
@@ -105,6 +110,17 @@ class Harmonics:
             self, gain=gain, gain_variance=np.maximum(left, LEAST_VARIANCE), without=reading.copy(),
             without_variance=self.noise.copy(), passes=1,
         )  # fmt: skip
+
+    def _of_hysteresis(self, path: ComplexArray) -> FloatArray:
+        """Return the variance (m^2, (K,)) of what is left of the hysteresis of a path, (K,), metres, in the reading.
+
+        It is a share of the path's own harmonics nearby, and of lower ones where it falls with the square of the
+        frequency, as turns make it. It passes through the mechanics, as the path itself does.
+        """
+        squared = np.arange(1.0, path.size) ** 2
+        turning = np.append(0.0, np.maximum.accumulate(np.abs(path[1:]) * squared) / squared)
+        share = REST_SHARE**2 * _around(np.abs(path) ** 2) + TURN_SHARE**2 * turning**2
+        return np.asarray(share * (np.abs(self.gain) ** 2 + self.gain_variance))
 
     def doubted(self, first: "Harmonics") -> "Harmonics":
         """Return the same with gains that may be wrong by as much as those of the first guess."""
@@ -123,9 +139,18 @@ class Harmonics:
             Harmonics to learn of; the others stay.
         """
         unexpected = reading - self.expected(correction)
-        before = self.variance(correction) + self.noise
-        changed = CHANGED_SHARE * np.maximum(_around(np.abs(unexpected) ** 2) - before, 0.0) + ERROR_WALK * self.noise
-        a, b = self.gain_variance + GAIN_WALK, self.without_variance + changed
+        # The hysteresis of the corrected path is another one.
+        moved = self._of_hysteresis(correction - self.answered)
+        before = self.variance(correction) + moved + self.noise
+        beyond = np.maximum(_around(np.abs(unexpected) ** 2) - before, 0.0)
+        scattered, size = self.scatter, float(np.mean(np.abs(correction - self.answered)[1:] ** 2))
+        scatter = scattered * size
+        if size > 0.0:
+            new = beyond / (size + float(np.mean(self.noise[1:])))
+            scattered = np.where(due, scattered + SCATTER_SHARE * (new - scattered), scattered)
+        moved, before = moved + scatter, before + scatter
+        changed = CHANGED_SHARE * np.maximum(beyond - scatter, 0.0) + ERROR_WALK * self.noise
+        a, b = self.gain_variance + GAIN_WALK, self.without_variance + changed + moved
         with_gain = a * correction.conj() + self.covariance
         with_rest = self.covariance.conj() * correction.conj() + b
         total = np.maximum((correction * with_gain + with_rest).real, 0.0) + self.noise
@@ -140,6 +165,8 @@ class Harmonics:
             without_variance=np.where(due, np.maximum(b - np.abs(k_rest) ** 2 * total, 0.0), self.without_variance),
             covariance=np.where(due, self.covariance - k_gain * k_rest.conj() * total, self.covariance),
             noise=np.where(due, self._noise_after(np.abs(unexpected) ** 2, before), self.noise),
+            answered=np.where(due, correction, self.answered),
+            scatter=scattered,
             passes=self.passes + 1,
         )
 
@@ -159,7 +186,7 @@ class Harmonics:
 
         The estimated error is divided by the gain where the phase is known to 45 degrees, less where the gain is
         uncertain (``conj(G) / (|G|^2 + P)``), and not by what may be noise. Elsewhere a test step is made whose answer
-        is at most a tenth of the error, or of the size of the noise: from it the gain is learned.
+        is at most a fifth of the error, or of the size of the noise: from it the gain is learned.
         """
         error = desired - self.expected(correction)
         size, variance = np.abs(error), self.variance(correction)

@@ -68,8 +68,10 @@ def judge(
     surprise = np.where(known, measured - expected, 0.0)
     surprise -= np.median(surprise[known])
     if not math.isfinite(spread):
-        bumps = _glitches(surprise, noise) | ~known
-        return Judged(_replaced(measured, expected, bumps), bumps, nowhere)
+        # Nothing tells a bump of the first pass from what its turns excite, but the second: there it is once more.
+        glitches = _glitches(surprise, noise)
+        bumps = ~known if before is None else (glitches & ~_widened(before)) | ~known
+        return Judged(_replaced(measured, expected, bumps), bumps, glitches)
     scale = max(float(np.median(np.abs(surprise[known]))) / 0.6745, noise, 0.5 * spread)
     deviating = np.abs(surprise) > BUMP * scale
     # What deviates in two passes at the same samples repeats, and is learned.

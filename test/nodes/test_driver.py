@@ -1,5 +1,6 @@
 """The driver as a process of its own, between DDS and a simulated controller over TCP."""
 
+import re
 import signal
 import socket
 from contextlib import contextmanager
@@ -15,13 +16,20 @@ from sensor_msgs.msg import JointState  # noqa: E402
 from std_msgs.msg import Float64MultiArray  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from slpi_ros.simulation.devices.base import LOST, Fault  # noqa: E402
+from slpi_ros.simulation.devices.base import FAULTS, LATE, LOST, Fault  # noqa: E402
 from slpi_ros.simulation.devices.gcs import GcsSimulator  # noqa: E402
 
 RATE, SLEW = 200.0, 500.0
 LIMITS = {"voltage_min": 0.0, "voltage_max": 100.0, "slew_limit": SLEW, "rate": RATE}
 # Of the limiter at most two periods count at once.
 LARGEST_STEP = 2.0 * SLEW / RATE + 2e-6
+
+
+# What a controller's faults are told as, in the order of `FAULTS`.
+REASONS = (
+    "no whole answer", "no whole answer", "answered for", "error 17", "no whole answer", "without having been|beyond what",
+    "closed the connection|link was lost", "not a name and a number", "not a name and a number|answered for|beyond what",
+)  # fmt: skip
 
 
 class Bench:
@@ -110,6 +118,26 @@ def test_a_lost_link_is_told_and_nothing_moves_until_it_is_armed():
         assert bench.call("arm").success
         bench.reach(80.0)
         assert largest_step(simulator, 20.0) <= LARGEST_STEP
+
+
+@pytest.mark.long
+def test_every_fault_is_told_with_its_reason_by_the_next_report_but_one():
+    """Reports come every half a second, so this is within a second."""
+    causes = dict(zip(FAULTS, REASONS, strict=True))
+    with GcsSimulator(voltages=[20.0]) as simulator, driver(simulator.address, rearm=True) as bench:
+        bench.connect()
+        for fault, cause in causes.items():
+            bench.status("armed")
+            given = Fault(fault, seconds=0.6 if fault in (LATE, LOST) else 0.0)
+            simulator.fault = given
+            bench.graph.spin_until(lambda: simulator.fault is not given, fault)  # noqa: B023
+            before = len(bench.graph.statuses("/driver: driver"))
+            told = bench.status("lost")
+            assert re.search(cause, values_of(told)["reason"]), fault
+            silent = bench.graph.statuses("/driver: driver")[before:]
+            assert [values_of(each)["state"] for each in silent].index("lost") <= 1
+        assert int(values_of(bench.status("armed"))["links_lost"]) >= len(FAULTS)
+        assert simulator.log == []
 
 
 @pytest.mark.parametrize(

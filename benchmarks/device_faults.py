@@ -197,7 +197,9 @@ def node_faults(name, folder, table):
         process = subprocess.Popen(command, stderr=subprocess.DEVNULL)
         try:
             spin(lambda: told and commands.get_subscription_count(), "the node")
-            for number, (fault, moving) in enumerate(((each, moving) for each in FAULTS for moving in (False, True)), 1):
+            for number, (fault, moving) in enumerate(
+                ((each, moving) for each in FAULTS for moving in (False, True)), 1
+            ):
                 for _ in range(10):
                     commands.publish(Float64MultiArray(data=[80.0 if moving and number % 4 else 30.0] * len(axes)))
                     rclpy.spin_once(node, timeout_sec=0.02)

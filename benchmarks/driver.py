@@ -175,7 +175,9 @@ def main():
     given = parser.parse_args()
     load = ", ".join(f"{each:.1f}" for each in os.getloadavg())
     print(f"{os.cpu_count()} processors; load of the last 1, 5 and 15 minutes: {load}")
-    print("way                    rate  answers after  cycles/s  left out  lateness p50  p99      max      processor, a cycle")
+    print(
+        "way                    rate  answers after  cycles/s  left out  lateness p50  p99      max      processor, a cycle"
+    )
     with tempfile.TemporaryDirectory() as folder:
         for row in ROWS:
             name, rate, delay = row
@@ -185,7 +187,9 @@ def main():
                 for _ in range(given.pairs):
                     measure(row, address, given.seconds)
                 if given.pipython and row == BESIDE:
-                    for checked, measured in zip((True, False), pipython(address, rate, given.seconds, folder), strict=True):
+                    for checked, measured in zip(
+                        (True, False), pipython(address, rate, given.seconds, folder), strict=True
+                    ):
                         print(measured.told(f"pipython{'' if checked else ', no ERR?'}", rate, delay), flush=True)
     print(f"load at the end: {os.getloadavg()[0]:.1f}", file=sys.stderr)
 

@@ -143,7 +143,9 @@ def test_one_message_after_the_other_as_all_at_once():
     position, effort = np.array([[1.5, np.nan], [-3.5, 0.0]]), np.array([[3.5, 4.5], [5.5, 6.5]])
     names = ("x", "another")
     encoder = JointStateEncoder(names, "stage")
-    one_by_one = [encoder.encode(*each) for each in zip(stamps.tolist(), position.tolist(), effort.tolist(), strict=True)]
+    one_by_one = [
+        encoder.encode(*each) for each in zip(stamps.tolist(), position.tolist(), effort.tolist(), strict=True)
+    ]
     assert one_by_one == encode_joint_states(stamps, position, effort, names, "stage")
 
 

@@ -240,9 +240,10 @@ def main():
             if "rclpy" in sys.modules:
                 node_faults(name, folder, table)
         published = f"{max(table.published):.2f} s of {len(table.published)}" if table.published else "-"
+        longest = table.longest
         print(
             f"{name:8} {table.faults:6d}  {table.step / ALLOWED:12.3f}  {table.moved:15d}  "
-            f"{table.longest['cycle']:11.3f} s  {table.longest['opening']:5.2f} s  {max(table.told):16.2f} s  {published}",
+            f"{longest['cycle']:11.3f} s  {longest['opening']:5.2f} s  {max(table.told):16.2f} s  {published}",
             flush=True,
         )
 

@@ -175,9 +175,7 @@ def main():
     given = parser.parse_args()
     load = ", ".join(f"{each:.1f}" for each in os.getloadavg())
     print(f"{os.cpu_count()} processors; load of the last 1, 5 and 15 minutes: {load}")
-    print(
-        "way                    rate  answers after  cycles/s  left out  lateness p50  p99      max      processor, a cycle"
-    )
+    print(f"{'way':22} rate  answers after  cycles/s  left out  lateness p50  p99      max      processor, a cycle")
     with tempfile.TemporaryDirectory() as folder:
         for row in ROWS:
             name, rate, delay = row

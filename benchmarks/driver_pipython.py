@@ -1,7 +1,8 @@
-"""PI's own client library at the controller that the driver is measured at: python driver_pipython.py ADDRESS RATE SECONDS.
+"""PI's own client library at a controller: python driver_pipython.py ADDRESS RATE SECONDS, started by driver.py.
 
-Runs where `pipython` is installed and nothing else of this package has to be. Prints, once as it comes (it asks ``ERR?``
-after each command) and once without that, cycles, seconds, processor seconds, and latenesses (s): median, p99, maximum.
+Runs where `pipython` is installed, and nothing of this package has to be. Prints, once as it comes (it asks ``ERR?``
+after each command) and once without that, cycles, seconds, seconds of the processor, and latenesses (s): median, 99th
+percentile, maximum.
 """
 
 import math

@@ -256,7 +256,7 @@ class DriveWatch:
         if self._stamp_bad >= STATES and self._now - self._stamp_bad_since >= LASTS:
             # States that a busy computer reads late look as those of a clock that was set.
             busy = (
-                "" if offset > 0.0 else ", or end other programs and lower the driver's rate if this computer is busy"
+                "" if offset > 0.0 else "; if this computer is busy, end other programs or give a longer state_timeout"
             )
             self._found(
                 f"the stamps of stage_state are {abs(offset):.3g} s {'ahead' if offset > 0.0 else 'old'}, "

@@ -10,10 +10,11 @@ from slpi_ros.reports.doctor import FAILED, NOTE, OK, Check
 
 # The limits to start with: so far on each side of the present voltage, V.
 NARROW = 5.0
-# Cycles per second that are advised, the first one of which half a period is enough for a reading: writing takes as long
-# again. Readings that are timed.
-RATES, TIMED = (1000, 500, 200, 100, 50, 20), 21
-# What the node takes for one unit of the position: 1 um; where the position is the voltage of a sensor, 100 um for 10 V.
+# Cycles per second to choose from: a reading shall take at most half a period, as writing may take as long again.
+RATES = (1000, 500, 200, 100, 50, 20)
+# Readings that are timed.
+TIMED = 21
+# Metres to start with for one unit of the position: 1 um; where that is the voltage of a sensor, 100 um for 10 V.
 SCALE, SENSOR_SCALES = 1e-6, {"labjack": 1e-5, "nidaqmx": 1e-5}
 
 
@@ -106,7 +107,7 @@ def device_parameters(kind: str, address: str, found: Found, channels: Sequence[
         f"    slew_limit: {2.0 * NARROW:.1f}",
         f"    # One reading takes {1e3 * cycle:.2g} ms.",
         f"    rate: {rate:.1f}",
-        "    # Volts at the stage for one volt of the device: of an amplifier behind it; the limits above are at the stage.",
+        "    # Volts at the stage, as those of the limits above, for one volt of the device: of an amplifier behind it.",
         "    amplifier_gain: 1.0",
         f"    # Metres for one unit of the position in the table ({unit}).",
         f"    sensor_scale: {scale:.1e}",

@@ -27,8 +27,9 @@ LARGEST_STEP = 2.0 * SLEW / RATE + 2e-6
 
 # What a controller's faults are told as, in the order of `FAULTS`.
 REASONS = (
-    "no whole answer", "no whole answer", "answered for", "error 17", "no whole answer", "without having been|beyond what",
-    "closed the connection|link was lost", "not a name and a number", "not a name and a number|answered for|beyond what",
+    "no whole answer", "no whole answer", "answered for", "error 17", "no whole answer",
+    "without having been|beyond what", "closed the connection|link was lost", "not a name and a number",
+    "not a name and a number|answered for|beyond what",
 )  # fmt: skip
 
 

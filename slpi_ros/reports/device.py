@@ -107,7 +107,7 @@ def device_parameters(kind: str, address: str, found: Found, channels: Sequence[
         f"    slew_limit: {2.0 * NARROW:.1f}",
         f"    # One reading takes {1e3 * cycle:.2g} ms.",
         f"    rate: {rate:.1f}",
-        "    # Volts at the stage, as those of the limits above, for one volt of the device: of an amplifier behind it.",
+        "    # V at the stage, as the limits above are, for one volt of the device: of an amplifier behind it.",
         "    amplifier_gain: 1.0",
         f"    # Metres for one unit of the position in the table ({unit}).",
         f"    sensor_scale: {scale:.1e}",

@@ -1,5 +1,6 @@
 """The driver as a process of its own, between DDS and a simulated controller over TCP."""
 
+import os
 import re
 import signal
 import socket
@@ -97,6 +98,13 @@ def test_voltages_go_to_the_device_and_positions_come_back():
         assert answer.success and "60, 30 V" in answer.message
         bench.status("held")
         assert bench.call("arm").success
+
+
+def test_it_asks_for_the_priority_that_is_given():
+    with GcsSimulator() as simulator, driver(simulator.address, realtime_priority=1) as bench:
+        bench.connect()
+        in_real_time = os.sched_getscheduler(bench.node.process.pid) == os.SCHED_FIFO
+        assert in_real_time != ("no realtime_priority 1" in bench.node.stderr)
 
 
 def test_a_lost_link_is_told_and_nothing_moves_until_it_is_armed():

@@ -21,7 +21,7 @@ CHECKOUT = Path(__file__).resolve().parents[1]
 sys.path.append(str(CHECKOUT / "demo"))
 
 import numpy as np  # noqa: E402
-from driver import DEVICE_PRIORITY, PRIORITY  # noqa: E402
+from driver import DEVICE_PRIORITY, PRIORITY, schedule  # noqa: E402
 from graph import EXECUTABLES, executable, operator  # noqa: E402
 from paths import scan_path  # noqa: E402
 
@@ -53,8 +53,7 @@ def stage(life, name, seed, folder):
     time.sleep(SETTLE)
     # A real device is not slowed by other programs here.
     with suppress(PermissionError):
-        for thread in Path(f"/proc/{process.pid}/task").iterdir():
-            os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(DEVICE_PRIORITY))
+        schedule(process.pid, os.SCHED_FIFO, DEVICE_PRIORITY)
     life.enter_context(
         executable(
             "driver", device=kind, address=found.format(**place), channels=f"['{channel}']", voltage_min=V_MIN,

@@ -69,15 +69,20 @@ class Row:
 @contextmanager
 def priority(level):
     """Give all threads of this process a real-time priority, as the node does; PermissionError where none is given."""
-    threads = [int(thread.name) for thread in Path("/proc/self/task").iterdir()]
     if level:
-        for thread in threads:
-            os.sched_setscheduler(thread, os.SCHED_FIFO, os.sched_param(level))
+        schedule("self", os.SCHED_FIFO, level)
     try:
         yield
     finally:
-        for thread in threads if level else ():
-            os.sched_setscheduler(thread, os.SCHED_OTHER, os.sched_param(0))
+        if level:
+            schedule("self", os.SCHED_OTHER, 0)
+
+
+def schedule(process, policy, level):
+    """Schedule all threads of a process by its number."""
+    for thread in Path(f"/proc/{process}/task").iterdir():
+        with suppress(ProcessLookupError):
+            os.sched_setscheduler(int(thread.name), policy, os.sched_param(level))
 
 
 def serve(connection, name, delay, address):

@@ -40,7 +40,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test test-long test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-agreement bench-confusion bench-driver bench-surroundings bench-learning bench-export bench-coverage test-export-arm FORCE
+.PHONY: help build test test-long test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-export bench-coverage test-export-arm FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -59,7 +59,9 @@ help:
 	@echo 'make bench-next-record   an advised second record, and pairs judged on a third; an hour or two'
 	@echo 'make bench-start-memory  100 memories at the start of a record: is a change told where there is one only'
 	@echo 'make bench-latency  round trip through the compensator beside a bare echo node, 4 minutes'
-	@echo 'make bench-driver    cycles of the driver with simulated devices: rate, lateness, processor, a minute'
+	@echo 'make bench-driver    cycles of the driver with simulated devices: rate, lateness, processor, two minutes'
+	@echo 'make bench-device-faults  faults of simulated devices: what moves, how long a call waits, when it is told, 4 minutes'
+	@echo 'make bench-device-lives   calibration, scan and verification through every driver and without one, 17 minutes'
 	@echo 'make bench-surroundings  hidden temperature and load: right topic, gain, decoys, a later day; half an hour'
 	@echo 'make bench-platforms  RECORD=table.csv: the ten commands with the versions of Ubuntu 24.04: the same figures?'
 	@echo 'make bench-restarts   a compensator that is killed and started again: time to its first answer, 10 minutes'
@@ -163,6 +165,12 @@ bench-learning: build
 
 bench-driver: build
 	$(IN_WORKSPACE) $(VENV) benchmarks/driver.py
+
+bench-device-faults: build
+	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/device_faults.py
+
+bench-device-lives: build
+	$(IN_WORKSPACE) $(VENV) benchmarks/device_lives.py
 
 bench-surroundings: build
 	$(VENV) benchmarks/surroundings.py

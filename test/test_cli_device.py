@@ -7,6 +7,9 @@ import yaml
 from drivers.kinds import KINDS
 from forked import completed
 
+from slpi_ros.drivers.base import Channel
+from slpi_ros.drivers.registry import make_device
+from slpi_ros.reports.device import RATES, SENSOR_SCALES, device_parameters
 from slpi_ros.simulation.devices.gcs import GcsSimulator
 from slpi_ros.simulation.devices.labjack import LabjackSimulator
 
@@ -28,10 +31,21 @@ def test_a_device_is_read_and_a_yaml_is_printed(name):
     text = done.stdout[done.stdout.index("driver:\n") :]
     values = yaml.safe_load(text[: text.index("\n\n")])["driver"]["ros__parameters"]
     assert values["device"] == kind.device and values["channels"] == [kind.axes[0]]
+    assert values["rate"] in RATES and values["sensor_scale"] == SENSOR_SCALES.get(kind.device, 1e-6)
     (low,), (high,) = values["voltage_min"], values["voltage_max"]
     at = 20.0 / kind.gain
     assert low <= at <= high and high - low <= 10.0
     assert f"{at:.4f} V" in done.stdout
+
+
+@pytest.mark.parametrize(("cycle", "rate"), [(0.0004, 1000.0), (0.0006, 500.0), (0.02, 20.0), (1.0, 20.0)])
+def test_the_rate_leaves_time_for_the_writing_and_a_y_is_a_name(cycle, rate):
+    with GcsSimulator(["1", "2"]) as simulator:
+        device = make_device("gcs", simulator.address, [Channel("1"), Channel("2")])
+        lines = device_parameters("gcs", simulator.address, device.open(), ["1", "2"], cycle)
+        device.close()
+    values = yaml.safe_load("\n".join(lines))["driver"]["ros__parameters"]
+    assert values["rate"] == rate and values["axes"] == ["x", "y"]
 
 
 def test_what_is_dangerous_fails():

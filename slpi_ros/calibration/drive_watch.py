@@ -254,9 +254,11 @@ class DriveWatch:
             self._stamp_bad_since = self._now
         self._stamp_bad += 1
         if self._stamp_bad >= STATES and self._now - self._stamp_bad_since >= LASTS:
+            # States that a busy computer reads late look as those of a clock that was set.
+            busy = "" if offset > 0.0 else "; if this computer is busy, end other programs or lower the driver's rate"
             self._found(
                 f"the stamps of stage_state are {abs(offset):.3g} s {'ahead' if offset > 0.0 else 'old'}, "
-                f"{abs(self._offset):.2g} s at the begin (limit {self._jump:g} s more); set the clock, repeat"
+                f"{abs(self._offset):.2g} s at the begin (limit {self._jump:g} s more); set the clock{busy}; repeat"
             )
 
     def _take(self, axis: str, relation: _Relation, v: float, y: float) -> None:

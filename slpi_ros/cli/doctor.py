@@ -127,20 +127,22 @@ def _read_device(device: str, channels: Sequence[str]) -> "tuple[list[Check], li
     """Open a device and read it; return the checks, and the lines with its table and the YAML to start with."""
     from slpi_ros.drivers.base import Channel
     from slpi_ros.drivers.registry import FIRST_CHANNEL, make_device
-    from slpi_ros.reports.device import check_device, device_parameters, device_table
+    from slpi_ros.reports.device import check_device, cycle_of, device_parameters, device_table
     from slpi_ros.reports.doctor import FAILED, Check
 
     kind, _, address = device.partition(":")
     dialect = address.partition(":")[0]
     names = list(channels) or [FIRST_CHANNEL.get(dialect) or FIRST_CHANNEL.get(kind, "1")]
-    opened = make_device(kind, address, [Channel(name) for name in names])
+    # Volts and positions in units of the device.
+    opened = make_device(kind, address, [Channel(name, scale=1.0) for name in names])
     try:
         found = opened.open()
+        cycle = cycle_of(opened)
     except SlpiError as error:
         return [Check(FAILED, str(error))], []
     finally:
         opened.close()
-    yaml = device_parameters(kind, address, found, names)
+    yaml = device_parameters(kind, address, found, names, cycle)
     return check_device(opened.name, found, names), [*device_table(found, names), "", "driver.yaml:", *yaml, ""]
 
 

@@ -25,11 +25,14 @@ class Stream(ABC):
     def __init__(self, name: str, ignored: bytes = b"") -> None:
         self._name, self._ignored = name, ignored
         self._buffer = b""
+        self._poll = select.poll()
 
     def open(self) -> None:
         """Connect anew; what came before is left out."""
         self.close()
         self._open()
+        self._poll = select.poll()
+        self._poll.register(self._file(), select.POLLIN)
 
     def close(self) -> None:
         """End the connection. Never raises."""
@@ -62,8 +65,7 @@ class Stream(ABC):
 
     def pending(self) -> bool:
         """Tell whether something has come that was not taken."""
-        file = self._file()
-        if file is not None and select.select([file], [], [], 0.0)[0]:
+        if self._file() is not None and self._poll.poll(0):
             self._receive("an answer without a question", TIMEOUT)
         return bool(self._buffer)
 
@@ -74,10 +76,8 @@ class Stream(ABC):
 
     def _receive(self, what: str, seconds: float) -> None:
         """Add what has come to the buffer, waiting for it if there is nothing."""
-        file = self._file()
-        assert file is not None
         try:
-            if not select.select([file], [], [], seconds)[0]:
+            if not self._poll.poll(seconds * 1e3):
                 raise LinkError(
                     f"{self._name}: no whole answer to {what} within {TIMEOUT:g} s; until then came {cut(self._buffer)}"
                 )
@@ -122,6 +122,9 @@ class TcpStream(Stream):
             self._socket = socket.create_connection((self._host, self._port), TIMEOUT)
             # A command leaves at once, not with the next one.
             self._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            # A time-out of the socket is one more system call for each sending and each reading. Its buffer takes many
+            # commands: one that is full belongs to a device that has not read for long.
+            self._socket.setblocking(False)
         except OSError as error:
             raise LinkError(
                 f"{self._name}: no connection ({error.strerror or error}); check that the device is on, its address "

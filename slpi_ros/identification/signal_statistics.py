@@ -134,15 +134,25 @@ def voltage_noise(t: FloatArray, v: FloatArray) -> float:
     """Return the noise (V rms) of a measured voltage, shape (N,), volts, by high-order differences; 0 if commanded."""
     if v.size <= max(_ORDERS):
         return 0.0
+    level = _level(t, v)
+    # A command that is read more often than it is sent is a staircase, whose steps are no noise: those of noise are
+    # there without the readings that repeat the one before, too.
+    fresh = np.diff(v, prepend=np.nan) != 0.0
+    if level and max(_ORDERS) < np.count_nonzero(fresh) < v.size:
+        level = min(level, _level(t[fresh], v[fresh]))
+    span = float(np.ptp(v))
+    return level if LEAST_NOISE * span < level < MOST_NOISE * span else 0.0
+
+
+def _level(t: FloatArray, v: FloatArray) -> float:
+    """Return the smallest estimate of the noise (V rms) by differences of several orders."""
     part = v[:ENOUGH]
     estimates = [noise(v, t)]
     for order in _ORDERS:
         # The squares of the binomial coefficients of a difference add up to the central binomial coefficient.
         size = np.sqrt(_central_binomial(order))
         estimates.append(float(1.4826 * np.median(np.abs(np.diff(part, order)))) / size)
-    level = min(estimates)
-    span = float(np.ptp(v))
-    return level if LEAST_NOISE * span < level < MOST_NOISE * span else 0.0
+    return min(estimates)
 
 
 def _central_binomial(order: int) -> float:

@@ -142,14 +142,38 @@ def encode_joint_states(
             f"sample {int(unfit.argmax())}: time {stamp_ns[unfit][0] / SECOND_NS:g} s does not "
             "fit into a message stamp (0 to 2^31 s); shift the time axis"
         )
-    zeros = (0.0,) * len(names)
-    template = serialise(0, 0, frame_id, len(names), *names, zeros, (), zeros)
+    template = _joint_state(names, frame_id)
     data = np.tile(np.frombuffer(template, np.uint8), stamp_ns.size)
     fields = data.view(read_message(template, JOINT_STATE).layout.dtype(len(template)))
     fields["sec"], fields["nanosec"] = np.divmod(stamp_ns, SECOND_NS)
     fields["position"], fields["effort"] = position, effort
     stream = data.tobytes()
     return [stream[start : start + len(template)] for start in range(0, len(stream), len(template))]
+
+
+def _joint_state(names: Sequence[str], frame_id: str) -> bytes:
+    """Return a serialised message with zeros for stamp, positions and efforts."""
+    zeros = (0.0,) * len(names)
+    return serialise(0, 0, frame_id, len(names), *names, zeros, (), zeros)
+
+
+class JointStateEncoder:
+    """Encoder of the JointState messages of one publisher; in each of them only the numbers change."""
+
+    def __init__(self, names: Sequence[str], frame_id: str) -> None:
+        template = _joint_state(names, frame_id)
+        self._data = bytearray(template)
+        fields = read_message(template, JOINT_STATE).layout.fields
+        self._stamp, self._numbers = struct.Struct("<2I"), struct.Struct(f"<{len(names)}d")
+        self._places = tuple(fields[name][1] for name in ("sec", "position", "effort"))
+
+    def encode(self, stamp_ns: int, positions: Sequence[float], efforts: Sequence[float]) -> bytes:
+        """Return the message of one header stamp (ns), with positions (m) and efforts (V) of all names."""
+        stamp, position, effort = self._places
+        self._stamp.pack_into(self._data, stamp, *divmod(stamp_ns, SECOND_NS))
+        self._numbers.pack_into(self._data, position, *positions)
+        self._numbers.pack_into(self._data, effort, *efforts)
+        return bytes(self._data)
 
 
 # Number of values before the strings: encapsulation, seconds, nanoseconds.

@@ -20,10 +20,20 @@ from slpi_ros.drivers.base import Channel, Reading
 from slpi_ros.drivers.registry import MODULES, make_device
 from slpi_ros.errors import SlpiError, UsageError, shown
 from slpi_ros.excitation.drives import slew_limits
-from slpi_ros.io.cdr import serialise
-from slpi_ros.io.messages import SECOND_NS, decode_trajectory, encode_trajectory
+from slpi_ros.io.messages import SECOND_NS, JointStateEncoder, decode_trajectory, encode_trajectory
 from slpi_ros.model.limits import Limits, volts
-from slpi_ros.nodes.common import COMMANDS, ERROR, LATCHED, OK, WARN, DeferredService, Diagnostics, Health, request_stop
+from slpi_ros.nodes.common import (
+    COMMANDS,
+    ERROR,
+    LATCHED,
+    OK,
+    WARN,
+    DeferredService,
+    Diagnostics,
+    Health,
+    ask_for_priority,
+    request_stop,
+)
 from slpi_ros.nodes.device_block import BlockPlayer, BlockRequest, BlockState, Told
 from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings, State
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
@@ -101,6 +111,10 @@ DECLARATIONS = (
         "hardware_id", "", "Identifier of the stage in stage_state; empty: what the device says of itself.",
         read_only=True,
     ),
+    Declaration(
+        "realtime_priority", 0, "SCHED_FIFO priority, 1 to 99, if the system permits; 0: normal scheduling.",
+        read_only=True, between=(0, 99),
+    ),
 )  # fmt: skip
 
 
@@ -162,8 +176,8 @@ class Driver(Node):
         device = make_device(values["device"], values["address"], settings.channels)
         self._device_name = device.name
         self._limits = dict(zip(values["axes"], settings.loop.limits, strict=True))
-        self._names = (len(values["axes"]), *values["axes"])
         self._frame = values["hardware_id"]
+        self._encoder: JointStateEncoder | None = None
         self._publisher = self.create_publisher(JointState, "stage_state", COMMANDS)
         self._diagnostics = Diagnostics(self, "driver")
         self._loop = DeviceLoop(device, settings.loop, self._publish)
@@ -182,6 +196,8 @@ class Driver(Node):
         self.create_timer(LOOK_PERIOD, self._look, clock=steady)
         self._thread = threading.Thread(target=self._run, name=device.name, daemon=True)
         self._thread.start()
+        if values["realtime_priority"]:
+            ask_for_priority(self, values["realtime_priority"])
 
     def destroy_node(self) -> None:
         """Let the thread of the device end, after the ramp to rest if there is one; then destroy the node."""
@@ -200,14 +216,14 @@ class Driver(Node):
             self._failure = error
 
     def _publish(self, reading: Reading) -> None:
-        if not self._frame and self._loop.found is not None:
-            self._frame = shown(self._loop.found.identity, LONGEST_IDENTITY)
+        if self._encoder is None:
+            assert self._loop.found is not None
+            self._frame = self._frame or shown(self._loop.found.identity, LONGEST_IDENTITY)
+            self._encoder = JointStateEncoder(self._values["axes"], self._frame)
         age_ns = time.monotonic_ns() - reading.read_ns
-        seconds, rest = divmod(self.get_clock().now().nanoseconds - age_ns, SECOND_NS)
+        stamp_ns = self.get_clock().now().nanoseconds - age_ns
         # As bytes: a message object takes several times longer.
-        self._publisher.publish(
-            serialise(seconds, rest, self._frame, *self._names, reading.positions, (), reading.voltages)
-        )
+        self._publisher.publish(self._encoder.encode(stamp_ns, reading.positions, reading.voltages))
 
     # Callbacks
 
@@ -305,7 +321,8 @@ class Driver(Node):
         if status.state is not State.LOST and late > LATE_SHARE * (cycles + late):
             problems.append(
                 (WARN, f"{late} of {cycles + late} cycles left out, as the device or this computer took longer than "
-                       f"{1e3 / self._values['rate']:.3g} ms; set rate to {cycles / elapsed:.0f} or less")
+                       f"{1e3 / self._values['rate']:.3g} ms; set rate to {cycles / elapsed:.0f} or less, or set "
+                       "realtime_priority")
             )  # fmt: skip
         timing = loop.timing.report()
         values: dict[str, object] = {

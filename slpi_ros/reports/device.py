@@ -1,13 +1,31 @@
 """What ``slpi doctor --device`` says of a device that was opened and read: what is there, and what will bite."""
 
 import math
+import statistics
+import time
 from collections.abc import Sequence
 
-from slpi_ros.drivers.base import Found
+from slpi_ros.drivers.base import Device, Found
 from slpi_ros.reports.doctor import FAILED, NOTE, OK, Check
 
 # The limits to start with: so far on each side of the present voltage, V.
 NARROW = 5.0
+# Cycles per second to choose from: a reading shall take at most half a period, as writing may take as long again.
+RATES = (1000, 500, 200, 100, 50, 20)
+# Readings that are timed.
+TIMED = 21
+# Metres to start with for one unit of the position: 1 um; where that is the voltage of a sensor, 100 um for 10 V.
+SCALE, SENSOR_SCALES = 1e-6, {"labjack": 1e-5, "nidaqmx": 1e-5}
+
+
+def cycle_of(device: Device) -> float:
+    """Return the time of one reading (s) of an open device, the median of several."""
+    times = []
+    for _ in range(TIMED):
+        begun = time.perf_counter()
+        device.read()
+        times.append(time.perf_counter() - begun)
+    return statistics.median(times)
 
 
 def check_device(name: str, found: Found, channels: Sequence[str]) -> list[Check]:
@@ -46,8 +64,8 @@ def check_device(name: str, found: Found, channels: Sequence[str]) -> list[Check
 
 
 def device_table(found: Found, channels: Sequence[str]) -> list[str]:
-    """Return a table of the channels of a device, in volts at the device."""
-    rows = [("channel", "voltage", "position", "own range", "servo")]
+    """Return a table of the channels of a device, in volts and units of the device."""
+    rows = [("channel", "voltage", "position, its unit", "own range", "servo")]
     for place, channel in enumerate(channels):
         x = found.reading.positions[place]
         rows.append(
@@ -63,24 +81,34 @@ def device_table(found: Found, channels: Sequence[str]) -> list[str]:
     return ["  ".join(text.ljust(width) for text, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def device_parameters(kind: str, address: str, found: Found, channels: Sequence[str]) -> list[str]:
-    """Return the YAML of the node ``driver`` to start with: narrow limits around the present voltages."""
+def device_parameters(kind: str, address: str, found: Found, channels: Sequence[str], cycle: float) -> list[str]:
+    """Return the YAML of the node ``driver`` to start with: narrow limits around the present voltages.
+
+    `cycle` is the time of one reading, s.
+    """
     lower = [max(low, v - NARROW) for low, v in zip(found.lowest, found.setpoints, strict=True)]
     upper = [min(high, v + NARROW) for high, v in zip(found.highest, found.setpoints, strict=True)]
     axes = ["x", "y", "z"] if len(channels) <= 3 else [f"axis{number}" for number in range(1, len(channels) + 1)]
-    texts = ", ".join(f"'{channel}'" for channel in channels)
+    # With quotation marks: YAML takes a bare y for a boolean.
+    names, texts = (", ".join(f"'{each}'" for each in some) for some in (axes[: len(channels)], channels))
+    rate = next((each for each in RATES if cycle <= 0.5 / each), RATES[-1])
+    scale = SENSOR_SCALES.get(kind, SCALE)
+    unit = "V; here 10 V for 100 um" if kind in SENSOR_SCALES else "here 1 um"
     return [
         "driver:",
         "  ros__parameters:",
         f"    device: {kind}",
         f"    address: '{address}'",
-        f"    axes: [{', '.join(axes[: len(channels)])}]",
+        f"    axes: [{names}]",
         f"    channels: [{texts}]",
         "    # Around the present voltage; the limits of the stage, once the first hour is over.",
         f"    voltage_min: [{', '.join(f'{v:.3f}' for v in lower)}]",
         f"    voltage_max: [{', '.join(f'{v:.3f}' for v in upper)}]",
         f"    slew_limit: {2.0 * NARROW:.1f}",
-        "    # Volts at the stage for one volt of the device, and metres for one unit of its position.",
+        f"    # One reading takes {1e3 * cycle:.2g} ms.",
+        f"    rate: {rate:.1f}",
+        "    # V at the stage, as the limits above are, for one volt of the device: of an amplifier behind it.",
         "    amplifier_gain: 1.0",
-        "    sensor_scale: 1.0e-6",
+        f"    # Metres for one unit of the position in the table ({unit}).",
+        f"    sensor_scale: {scale:.1e}",
     ]

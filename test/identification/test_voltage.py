@@ -27,6 +27,21 @@ def test_what_is_no_noise_is_left_alone():
         assert without_noise(np.arange(v.size) * 1.0, v) is v
 
 
+@pytest.mark.parametrize("often", [2, 3, 10])
+def test_a_command_that_is_read_more_often_than_it_is_sent_is_left_alone(often):
+    t, v = calibration_drive(0.0, 100.0, duration=30.0, rate=100.0, seed=1)
+    readings = np.repeat(v, often)
+    times = np.arange(readings.size) / (100.0 * often)
+    assert without_noise(times, readings) is readings
+
+
+@pytest.mark.parametrize("often", [2, 3])
+def test_noise_that_is_read_more_often_than_it_is_measured_is_noise(often):
+    _, v = calibration_drive(0.0, 100.0, duration=30.0, rate=100.0, seed=1)
+    noisy = np.repeat(v + np.random.default_rng(0).normal(0.0, 0.05, v.size), often)
+    assert voltage_noise(np.arange(noisy.size) / (100.0 * often), noisy) == pytest.approx(0.05, rel=0.1)
+
+
 @pytest.mark.parametrize("rate", [200.0, 2000.0])
 def test_noise_is_measured_and_mostly_gone(rate):
     t, v = calibration_drive(0.0, 100.0, duration=30.0, rate=rate, seed=1)

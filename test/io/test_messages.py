@@ -10,7 +10,7 @@ from rosbags.typesys import Stores, get_typestore
 from slpi_ros.errors import RecordError
 from slpi_ros.io.bag_reader import decode_signals
 from slpi_ros.io.bag_storage import MessageBlock
-from slpi_ros.io.messages import JOINT_STATE, encode_joint_states, read_message
+from slpi_ros.io.messages import JOINT_STATE, JointStateEncoder, encode_joint_states, read_message
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 
@@ -136,6 +136,17 @@ def test_rclpy_both_ways():
     assert again["sec"].tolist() == [12] * 3
     assert again["nanosec"].tolist() == [34] * 3
     assert again["position"].tolist() == [[1.5, 2.5]] * 3
+
+
+def test_one_message_after_the_other_as_all_at_once():
+    stamps = np.array([12_000_000_034, 2**31 * 10**9 - 1])
+    position, effort = np.array([[1.5, np.nan], [-3.5, 0.0]]), np.array([[3.5, 4.5], [5.5, 6.5]])
+    names = ("x", "another")
+    encoder = JointStateEncoder(names, "stage")
+    one_by_one = [
+        encoder.encode(*each) for each in zip(stamps.tolist(), position.tolist(), effort.tolist(), strict=True)
+    ]
+    assert one_by_one == encode_joint_states(stamps, position, effort, names, "stage")
 
 
 @pytest.mark.parametrize("stamp", [-1, 2**31 * 10**9])

@@ -1,5 +1,7 @@
 """The driver as a process of its own, between DDS and a simulated controller over TCP."""
 
+import os
+import re
 import signal
 import socket
 from contextlib import contextmanager
@@ -15,13 +17,21 @@ from sensor_msgs.msg import JointState  # noqa: E402
 from std_msgs.msg import Float64MultiArray  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 
-from slpi_ros.simulation.devices.base import LOST, Fault  # noqa: E402
+from slpi_ros.simulation.devices.base import FAULTS, LATE, LOST, Fault  # noqa: E402
 from slpi_ros.simulation.devices.gcs import GcsSimulator  # noqa: E402
 
 RATE, SLEW = 200.0, 500.0
 LIMITS = {"voltage_min": 0.0, "voltage_max": 100.0, "slew_limit": SLEW, "rate": RATE}
 # Of the limiter at most two periods count at once.
 LARGEST_STEP = 2.0 * SLEW / RATE + 2e-6
+
+
+# What a controller's faults are told as, in the order of `FAULTS`.
+REASONS = (
+    "no whole answer", "no whole answer", "answered for", "error 17", "no whole answer",
+    "without having been|beyond what", "closed the connection|link was lost", "not a name and a number",
+    "not a name and a number|answered for|beyond what",
+)  # fmt: skip
 
 
 class Bench:
@@ -90,6 +100,13 @@ def test_voltages_go_to_the_device_and_positions_come_back():
         assert bench.call("arm").success
 
 
+def test_it_asks_for_the_priority_that_is_given():
+    with GcsSimulator() as simulator, driver(simulator.address, realtime_priority=1) as bench:
+        bench.connect()
+        in_real_time = os.sched_getscheduler(bench.node.process.pid) == os.SCHED_FIFO
+        assert in_real_time != ("no realtime_priority 1" in bench.node.stderr)
+
+
 def test_a_lost_link_is_told_and_nothing_moves_until_it_is_armed():
     with GcsSimulator(voltages=[20.0]) as simulator, driver(simulator.address) as bench:
         bench.connect().reach(40.0)
@@ -112,18 +129,40 @@ def test_a_lost_link_is_told_and_nothing_moves_until_it_is_armed():
         assert largest_step(simulator, 20.0) <= LARGEST_STEP
 
 
+@pytest.mark.long
+def test_every_fault_is_told_with_its_reason_by_the_next_report_but_one():
+    """Reports come every half a second, so this is within a second."""
+    causes = dict(zip(FAULTS, REASONS, strict=True))
+    with GcsSimulator(voltages=[20.0]) as simulator, driver(simulator.address, rearm=True) as bench:
+        bench.connect()
+        for fault, cause in causes.items():
+            bench.status("armed")
+            given = Fault(fault, seconds=0.6 if fault in (LATE, LOST) else 0.0)
+            simulator.fault = given
+            bench.graph.spin_until(lambda: simulator.fault is not given, fault)  # noqa: B023
+            before = len(bench.graph.statuses("/driver: driver"))
+            told = bench.status("lost")
+            assert re.search(cause, values_of(told)["reason"]), fault
+            silent = bench.graph.statuses("/driver: driver")[before:]
+            assert [values_of(each)["state"] for each in silent].index("lost") <= 1
+        assert int(values_of(bench.status("armed"))["links_lost"]) >= len(FAULTS)
+        assert simulator.log == []
+
+
 @pytest.mark.parametrize(
     ("end", "parameters", "voltage"),
     [(signal.SIGTERM, {}, 60.0), (signal.SIGKILL, {}, 60.0), (signal.SIGINT, {"at_exit": "rest"}, 0.0)],
 )
 def test_its_end_and_the_next_start(end, parameters, voltage):
+    # On a busy machine the simulated device, in this process, may answer too late.
+    parameters = {"rearm": True, **parameters}
     with GcsSimulator(voltages=[20.0]) as simulator:
         with driver(simulator.address, **parameters) as bench:
             bench.connect().reach(60.0)
             code = bench.node.stop(end)
             assert code == (-end if end == signal.SIGKILL else 0) and "Traceback" not in bench.node.stderr
         assert simulator.voltage("1") == voltage
-        with driver(simulator.address) as bench:
+        with driver(simulator.address, rearm=True) as bench:
             bench.connect()
             assert list(bench.states[0].effort) == [voltage] and simulator.voltage("1") == voltage
             bench.reach(50.0)

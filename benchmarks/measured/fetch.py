@@ -75,7 +75,7 @@ class Remote:
         place = self._folder / source.repository.replace("/", "+")
         _git(["init", "--quiet", place], source.repository)
         url = f"https://github.com/{source.repository}.git"
-        _git(["-C", place, "remote", "add", "origin", url], source.repository)
+        _git(["-C", place, "config", "remote.origin.url", url], source.repository)
         # Without its blobs: a file is fetched when it is read.
         fetch = ["fetch", "--quiet", "--depth", "1", "--filter=blob:none", "origin", source.commit]
         _git(["-C", place, *fetch], url)
@@ -125,7 +125,6 @@ def write(name: str, table: bytes, folder: Path) -> str:
 
 def fetch(manifest: Manifest, names: Sequence[str], files: Files, folder: Path) -> list[str]:
     """Fetch the records `names` into `folder`; return what went wrong, one line each."""
-    folder.mkdir(parents=True, exist_ok=True)
     problems: list[str] = []
     for name in names:
         record = manifest.records[name]
@@ -146,7 +145,11 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--only", nargs="+", metavar="RECORD", help="these records alone")
     parser.add_argument("--manifest", type=Path, default=MANIFEST, help="another manifest")
     options = parser.parse_args(arguments)
-    manifest = read_manifest(options.manifest)
+    try:
+        manifest = read_manifest(options.manifest)
+        options.output.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        parser.error(f"{error.filename}: {error.strerror}")
     names = options.only or list(manifest.records)
     if unknown := [name for name in names if name not in manifest.records]:
         parser.error(f"no record {', '.join(unknown)}; there are {', '.join(manifest.records)}")

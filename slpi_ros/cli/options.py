@@ -54,7 +54,7 @@ class _UniqueNames(Action):
         names = list(values or ())
         for name in names:
             if names.count(name) > 1:
-                raise ArgumentError(self, f"'{name}' is given more than once; name each axis once")
+                raise ArgumentError(self, f"'{name}' is given more than once; name each once")
         setattr(namespace, self.dest, names)
 
 

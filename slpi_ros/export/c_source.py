@@ -1,5 +1,6 @@
 """The inverse of a stage as C source: tables and fields of each axis, put into the templates."""
 
+import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from functools import cache
@@ -253,7 +254,9 @@ def templates() -> Environment:
 def comment(text: str) -> str:
     """Return a text that cannot end a comment, of printable ASCII."""
     plain = "".join(one if " " <= one <= "~" else "?" for one in text)
-    return plain.replace("*/", "* /").replace("/*", "/ *").replace("\\", "/").replace('"', "'").replace("??", "? ?")
+    plain = plain.replace("\\", "/").replace('"', "'").replace("*/", "* /").replace("/*", "/ *")
+    # No two question marks in a row begin a trigraph.
+    return re.sub(r"\?(?=\?)", "? ", plain)
 
 
 def context_of(stage: ExportedStage) -> Mapping[str, Any]:

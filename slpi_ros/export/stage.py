@@ -254,3 +254,8 @@ def require_numbers(axis: ExportedAxis) -> None:
             f"axis '{axis.name}': limits {allowed.lower:g} to {allowed.upper:g} V are too wide for an export; "
             "give --voltage-min and --voltage-max"
         )
+    if allowed.lower == allowed.upper:
+        raise UsageError(
+            f"axis '{axis.name}': limits and identified range have only {allowed.lower:g} V in common; "
+            "give limits between which the voltage can move"
+        )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.errors import SlpiError, UnreachableError
+from slpi_ros.errors import SlpiError, UnreachableError, UsageError
 from slpi_ros.export.c_source import context_of, templates
 from slpi_ros.export.stage import ExportedStage
 from slpi_ros.model.streaming import StageStream
@@ -204,6 +204,8 @@ def vectors(stage: ExportedStage, steps: int = STEPS, seed: int = 1) -> Vectors:
             # Beyond the model: the axes before it have moved.
             break
         before = stamp
+    if not rows:
+        raise UsageError("the model reaches no displacement of its range, and cannot be exported; identify it again")
     times, wanted, volts, codes = zip(*rows, strict=True)
     kinds = np.array(codes, dtype=np.int64)
     return Vectors(np.array(times), np.array(wanted), np.array(volts), kinds, np.array(given[: len(rows)]))

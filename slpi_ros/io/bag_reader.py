@@ -104,7 +104,12 @@ def _with_surroundings(
         try:
             full, signals = bag.full_name(topic), bag.read(topic, QUANTITY_TYPES)
             since_start = since_start_of(signals, int(record.time_ns[0]), state)
-            found |= courses(signals, Chosen(full, field), bag.types[full], since_start)
+            read = dict(courses(signals, Chosen(full, field), bag.types[full], since_start))
+            if wanted is not None and not read:
+                raise RecordError(f"topic '{topic}' has no finite reading; leave it out, or check its sensor")
+            found |= read
+            if full in taken and (not field or field.partition(".")[2] in record.axes):
+                raise UsageError(f"'{topic}' is of the stage itself; name quantities beside it")
         except SlpiError as error:
             if wanted is not None:
                 where = f"{record.source}: "

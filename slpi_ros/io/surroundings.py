@@ -33,6 +33,8 @@ AVERAGINGS, MOST_AVERAGED = np.array([1.0, 2.0, 4.0, 8.0, 16.0, 32.0]), 5000
 IS_NOISE = 1.3
 # Ratio of the median magnitude of second differences of white noise to its standard deviation.
 SECOND_DIFFERENCES = 0.6745 * 6.0**0.5
+# A reading of a larger magnitude is missing: its square is no number.
+LARGEST = 1e100
 
 
 class Chosen(NamedTuple):
@@ -128,7 +130,7 @@ def value_of(data: bytes, msgtype: str, field: str) -> float | None:
 def clean(course: Course) -> Course:
     """Return a course without missing readings, at increasing times."""
     t, value = course
-    known = np.isfinite(t) & np.isfinite(value)
+    known = np.isfinite(t) & (np.abs(value) < LARGEST)
     t, value = t[known], value[known]
     later = np.diff(t, prepend=-np.inf) > 0.0
     return t[later], value[later]

@@ -99,7 +99,9 @@ def write_files(folder: Path, document: dict[str, Any]) -> None:
             "issued": document["issued"],
             "model": f"{made['source']}, identified {made['created'] or 'at an unknown time'}",
             "SHA-256 of the model": made["sha256"],
-            "tolerance of the rms error": length(document["tolerance_m"]) if document["tolerance_m"] else "none given",
+            "tolerance of the rms error": length(document["tolerance_m"])
+            if document["tolerance_m"]
+            else "none given; the limit of each record is in the table of its errors",
         }
     )
     page.contents(tuple(document["axes"]))

@@ -79,6 +79,9 @@ def test_as_from_the_network(published, tmp_path, monkeypatch):
 
 def test_without_a_network_one_line(published, tmp_path, monkeypatch, capsys):
     _, manifest = published
+    document = json.loads(manifest.read_text())
+    document["records"]["another"] = document["records"]["line"]
+    manifest.write_text(json.dumps(document))
     monkeypatch.setenv("GIT_CONFIG_COUNT", "1")
     monkeypatch.setenv("GIT_CONFIG_KEY_0", f"url.file://{tmp_path}/nothing/.insteadOf")
     monkeypatch.setenv("GIT_CONFIG_VALUE_0", "https://github.com/")
@@ -86,6 +89,15 @@ def test_without_a_network_one_line(published, tmp_path, monkeypatch, capsys):
     (line,) = capsys.readouterr().err.splitlines()
     assert "https://github.com/someone/rig.git" in line
     assert not (tmp_path / "out" / "line.csv").exists()
+
+
+def test_a_folder_that_cannot_be_made_takes_one_line(published, tmp_path, capsys):
+    mirror, manifest = published
+    (tmp_path / "out").write_text("a file")
+    with pytest.raises(SystemExit) as ended:
+        fetch.main(["-o", str(tmp_path / "out"), "--mirror", str(mirror), "--manifest", str(manifest)])
+    assert ended.value.code == 2
+    assert "File exists" in capsys.readouterr().err.splitlines()[-1]
 
 
 def test_another_file_is_refused(published, tmp_path, capsys):

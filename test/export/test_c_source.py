@@ -336,6 +336,6 @@ def test_an_effect_without_exported_form_is_refused_by_name(monkeypatch):
 
 def test_names_of_axes_cannot_leave_their_comment(tmp_path):
     model = one_axis()
-    name = 'x*/ int "a\\ ??/\n\N{MICRO SIGN}'
+    name = 'x*/ int "a\\ ??/\n\N{MICRO SIGN}???/'
     stage = ExportedStage.of(StageModel({name: model.axes["x"]}, "*/ #error"), FREE)
     build(tmp_path, stage)

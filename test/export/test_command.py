@@ -10,6 +10,7 @@ from export.stages import EVERY, one_axis, two_axes
 
 from slpi_ros import save_model
 from slpi_ros.cli import main
+from slpi_ros.effects.contact import Contact
 
 FILES = {"slpi_inverse.h", "slpi_inverse.c", "slpi_test.c"}
 
@@ -56,6 +57,8 @@ def test_the_vectors_show_the_limits(model, tmp_path):
         (["--slew-limit", "nan"], 2),
         (["--voltage-min", "200"], 2),
         (["--voltage-min", "50", "--voltage-max", "20"], 2),
+        (["--voltage-min", "20", "--voltage-max", "20"], 2),
+        (["--voltage-max", "0"], 2),
         (["--target", "fortran"], 2),
     ],
 )
@@ -67,6 +70,12 @@ def test_what_it_refuses_takes_one_line(model, tmp_path, capsys, options, code):
     assert found == code
     assert len(capsys.readouterr().err.splitlines()) == 1
     assert not (tmp_path / "c").exists()
+
+
+def test_a_model_that_reaches_nothing_is_refused(tmp_path, capsys):
+    save_model(one_axis("slpi", (Contact(0.0, 1e-9),)), tmp_path / "model.json")
+    assert main(["export", str(tmp_path / "model.json"), "-o", str(tmp_path / "c")]) == 2
+    assert len(capsys.readouterr().err.splitlines()) == 1 and not (tmp_path / "c").exists()
 
 
 def test_foreign_files_are_not_replaced(model, tmp_path, capsys):

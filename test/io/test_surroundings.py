@@ -7,7 +7,7 @@ import pytest
 from bag_makers import STORE, float64, header, joint_state, rosbags_bag
 from refusals import holds, refusal
 
-from slpi_ros.errors import RecordError
+from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.bag_reader import read_bag
 from slpi_ros.io.surroundings import clean, named_in
 
@@ -95,6 +95,8 @@ def test_named_quantities(tmp_path):
     assert holds(
         refusal(RecordError, read_bag, bag, surroundings=["stage_state:velocity.x"]), "velocity.x", "position.x"
     )
+    for own in ("stage_state", "/stage_state:position.x", "stage_state:effort.x"):
+        assert holds(refusal(UsageError, read_bag, bag, surroundings=[own]), "stage itself")
     record = read_bag(bag)
     assert set(named_in(record.surroundings, ["load:force.z", "/room/temperature"])) == {
         "/load:force.z",
@@ -103,6 +105,13 @@ def test_named_quantities(tmp_path):
     assert named_in(record.surroundings, ["temperature:force"]) == {
         "/room/temperature": record.surroundings["/room/temperature"]
     }
+
+
+def test_a_named_quantity_without_any_reading_is_refused(tmp_path):
+    beside = {"/temperature": [(START, temperature(START, np.nan))]}
+    bag = rosbags_bag(tmp_path / "bag", {"/stage_state": STATE, **beside})
+    assert holds(refusal(RecordError, read_bag, bag, surroundings=["temperature"]), "temperature", "no finite reading")
+    assert read_bag(bag).surroundings == {}
 
 
 def test_what_cannot_be_read_is_said_unless_it_was_asked_for(tmp_path):
@@ -123,3 +132,8 @@ def test_courses_have_one_value_for_each_time(tmp_path):
     record = read_bag(rosbags_bag(tmp_path / "bag", {"/stage_state": STATE}))
     with pytest.raises(RecordError):
         replace(record, surroundings={"/t": (np.zeros(2), np.zeros(3))})
+
+
+def test_readings_too_large_for_arithmetic_are_missing():
+    t, value = clean((np.arange(4.0), np.array([20.0, 1e308, -np.inf, 21.0])))
+    assert t.tolist() == [0.0, 3.0] and value.tolist() == [20.0, 21.0]

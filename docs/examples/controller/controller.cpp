@@ -1,4 +1,5 @@
 // A sine of each axis through the wrapper, as `update` of a controller would do at 10 kHz; prints the last voltages.
+// Build with -DSTART_VOLTS=.. (V, where the amplifier is), -DMIDDLE=.. and -DSPAN=.. (m, of the stage's range).
 #include <cmath>
 #include <cstdio>
 #include <type_traits>

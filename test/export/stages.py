@@ -1,9 +1,11 @@
 """Random stages for an export: every causal kind, with effects of the stage, in the ranges that they reach."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
 from effects.cases import BY_NAME
+from hypothesis import reject
 from hypothesis import strategies as st
 from strategies import cases, fractions
 
@@ -21,11 +23,14 @@ from slpi_ros.effects.saturation import Saturation
 from slpi_ros.effects.self_heating import SelfHeating
 from slpi_ros.effects.slew import Slew
 from slpi_ros.effects.surroundings import Quantity, Surroundings
+from slpi_ros.errors import UsageError
+from slpi_ros.export.stage import ExportedStage
 from slpi_ros.hysteresis.kinds import CausalModel
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.multi_slope import MultiSlope
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
+from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
 
 QUALITY = FitQuality(8e-9, 3e-8, 8e-9, 8e-9, 1234, 0.75, "bag")
@@ -94,8 +99,14 @@ def axes(draw: st.DrawFn, others: tuple[str, ...] = ()) -> AxisModel:
 
 @st.composite
 def stages(draw: st.DrawFn) -> StageModel:
+    """Draw models whose voltage can move within their range; of others there is nothing to export."""
     names = draw(st.sampled_from((("x",), ("x", "y"))))
-    return StageModel({name: draw(axes(tuple(other for other in names if other != name))) for name in names})
+    model = StageModel({name: draw(axes(tuple(other for other in names if other != name))) for name in names})
+    try:
+        ExportedStage.of(model, Limits(-math.inf, math.inf))
+    except UsageError:
+        reject()
+    return model
 
 
 def family(n: int = 21) -> LoopFamily:

@@ -460,7 +460,19 @@ def _extended(model: AxisModel, now: Explanation, source: str) -> AxisModel:
         ),
     )
     quality = with_statistics(extended.quality, _errors(now), extended.displacement_range)
-    return replace(extended, quality=quality, end=extended.at_rest(now.u, float(evidence.v[-1])))
+    extended = replace(extended, quality=quality, end=extended.at_rest(now.u, float(evidence.v[-1])))
+    own = [effect.parts[0] for effect in now.effects if isinstance(effect, EachRecord)]
+    return _from_end(extended, sum(effect.from_end()[1] for effect in own))
+
+
+def _from_end(model: AxisModel, by: float) -> AxisModel:
+    """Return the model with the zero of the end of its first record: a drift of the record ends at zero.
+
+    `by` (m) is where drifts that are not in the model were at that end.
+    """
+    counted = [effect.from_end() for effect in model.effects]
+    moved = replace(model, effects=tuple(effect for effect, _ in counted)).shifted(by + sum(end for _, end in counted))
+    return replace(moved, displacement_range=model.displacement_range)
 
 
 def _errors(now: Explanation) -> list[tuple[FloatArray, ...]]:

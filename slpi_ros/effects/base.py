@@ -330,6 +330,10 @@ class EffectBase(Protocol):
         """Return the effect with the displacement `rest` (m) as its origin, if it needs one and has none."""
         return self
 
+    def from_end(self) -> tuple[Self, float]:
+        """Return the effect counted from the end of its record, and the displacement (m) that it had there."""
+        return self, 0.0
+
     def shifted(self, by: float) -> Self:
         """Return the effect for a zero of the displacement that has moved by `by` (m)."""
         if "origin" not in facts_of(type(self)):

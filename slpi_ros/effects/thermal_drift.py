@@ -1,7 +1,7 @@
 """Thermal drift: slow change of the displacement, independent of the voltage."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar
 
@@ -84,6 +84,11 @@ class ThermalDrift(EffectBase):
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement without drift, shape (N,), metres."""
         return signal - np.interp(around.t, self.times, self.values)
+
+    def from_end(self) -> tuple["ThermalDrift", float]:
+        """Return the drift that ends at zero, and the displacement (m) at the end."""
+        end = self.values[-1]
+        return replace(self, values=tuple(value - end for value in self.values)), end
 
     @classmethod
     def fit(cls, context: ResidualContext) -> Iterator[Candidate]:

@@ -188,7 +188,7 @@ bench-xy: build
 	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/xy_stage.py
 
 bench-readme: build
-	$(IN_WORKSPACE) $(VENV) benchmarks/readme_steps.py
+	$(IN_WORKSPACE) $(VENV) -m benchmarks.readme_steps
 
 bench-steps: build
 	$(IN_WORKSPACE) PYTHONPATH=.:test ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) -m benchmarks.steps $(STEPS)

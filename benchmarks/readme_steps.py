@@ -14,7 +14,6 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-import kept
 import numpy as np
 import rclpy
 import yaml
@@ -25,6 +24,7 @@ from std_msgs.msg import Float64MultiArray
 from std_srvs.srv import Trigger
 
 import slpi_ros
+from benchmarks import kept
 
 FloatArray = NDArray[np.float64]
 CHECKOUT = Path(__file__).resolve().parents[1]

@@ -461,8 +461,8 @@ def _extended(model: AxisModel, now: Explanation, source: str) -> AxisModel:
     )
     quality = with_statistics(extended.quality, _errors(now), extended.displacement_range)
     extended = replace(extended, quality=quality, end=extended.at_rest(now.u, float(evidence.v[-1])))
-    own = [effect.parts[0] for effect in now.effects if isinstance(effect, EachRecord)]
-    return _from_end(extended, sum(effect.from_end()[1] for effect in own))
+    separate: list[Any] = [effect for effect in now.effects if isinstance(effect, EachRecord)]
+    return _from_end(extended, sum(one.parts[0].from_end()[1] for one in separate))
 
 
 def _from_end(model: AxisModel, by: float) -> AxisModel:

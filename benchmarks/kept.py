@@ -25,15 +25,17 @@ def read(section: str, path: Path = KEPT) -> dict[str, Any]:
 
 def write(section: str, command: str, figures: Any, path: Path = KEPT) -> None:
     """Replace the figures of a section; the others stay as they are."""
-    document = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    document[section] = {**_when(command), "figures": figures}
-    path.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    _replace(section, {**_when(command), "figures": figures}, path)
 
 
 def write_row(key: str, what: str, measured: str, command: str, path: Path = KEPT) -> None:
     """Replace a row of README's table: what was measured, the figures as text, and the command that prints them."""
+    _replace(ROWS, {**read(ROWS, path), key: {"what": what, "measured": measured, **_when(command)}}, path)
+
+
+def _replace(section: str, content: dict[str, Any], path: Path) -> None:
     document = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
-    document.setdefault(ROWS, {})[key] = {"what": what, "measured": measured, **_when(command)}
+    document[section] = content
     path.write_text(json.dumps(document, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 

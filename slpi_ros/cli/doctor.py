@@ -2,6 +2,8 @@
 
 import math
 import shlex
+import statistics
+import time
 from argparse import ArgumentParser, Namespace
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
@@ -12,11 +14,14 @@ from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.progress import report_progress
 
 if TYPE_CHECKING:
+    from slpi_ros.drivers.base import Device
     from slpi_ros.reports.doctor import Check
 
 COMMANDS_TOPIC = "voltage_command"
 # Longest time to watch a running graph, seconds.
 LONGEST_WATCH = 3600.0
+# Readings of a device that are timed.
+TIMED = 21
 
 
 def _add_options(command: ArgumentParser) -> None:
@@ -127,7 +132,7 @@ def _read_device(device: str, channels: Sequence[str]) -> "tuple[list[Check], li
     """Open a device and read it; return the checks, and the lines with its table and the YAML to start with."""
     from slpi_ros.drivers.base import Channel
     from slpi_ros.drivers.registry import FIRST_CHANNEL, make_device
-    from slpi_ros.reports.device import check_device, cycle_of, device_parameters, device_table
+    from slpi_ros.reports.device import check_device, device_parameters, device_table
     from slpi_ros.reports.doctor import FAILED, Check
 
     kind, _, address = device.partition(":")
@@ -137,13 +142,23 @@ def _read_device(device: str, channels: Sequence[str]) -> "tuple[list[Check], li
     opened = make_device(kind, address, [Channel(name, scale=1.0) for name in names])
     try:
         found = opened.open()
-        cycle = cycle_of(opened)
+        cycle = _cycle_of(opened)
     except SlpiError as error:
         return [Check(FAILED, str(error))], []
     finally:
         opened.close()
     yaml = device_parameters(kind, address, found, names, cycle)
     return check_device(opened.name, found, names), [*device_table(found, names), "", "driver.yaml:", *yaml, ""]
+
+
+def _cycle_of(device: "Device") -> float:
+    """Return the time of one reading (s) of an open device, the median of several."""
+    times = []
+    for _ in range(TIMED):
+        begun = time.perf_counter()
+        device.read()
+        times.append(time.perf_counter() - begun)
+    return statistics.median(times)
 
 
 COMMAND = Command(

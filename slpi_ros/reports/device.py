@@ -1,31 +1,17 @@
 """What ``slpi doctor --device`` says of a device that was opened and read: what is there, and what will bite."""
 
 import math
-import statistics
-import time
 from collections.abc import Sequence
 
-from slpi_ros.drivers.base import Device, Found
+from slpi_ros.drivers.base import Found
 from slpi_ros.reports.doctor import FAILED, NOTE, OK, Check
 
 # The limits to start with: so far on each side of the present voltage, V.
 NARROW = 5.0
 # Cycles per second to choose from: a reading shall take at most half a period, as writing may take as long again.
 RATES = (1000, 500, 200, 100, 50, 20)
-# Readings that are timed.
-TIMED = 21
 # Metres to start with for one unit of the position: 1 um; where that is the voltage of a sensor, 100 um for 10 V.
 SCALE, SENSOR_SCALES = 1e-6, {"labjack": 1e-5, "nidaqmx": 1e-5}
-
-
-def cycle_of(device: Device) -> float:
-    """Return the time of one reading (s) of an open device, the median of several."""
-    times = []
-    for _ in range(TIMED):
-        begun = time.perf_counter()
-        device.read()
-        times.append(time.perf_counter() - begun)
-    return statistics.median(times)
 
 
 def check_device(name: str, found: Found, channels: Sequence[str]) -> list[Check]:

@@ -296,7 +296,8 @@ def keep(specimen: Specimen, seed: int, passes: int, errors: Mapping[str, Any]) 
         f"a path that repeats, on a simulated stage of another physics ({specimen.kind}, a mode of "
         f"{specimen.frequency:.0f} Hz with a damping of {specimen.damping:.3f}, {1e9 * specimen.noise:.1f} nm of "
         "sensor noise): true error on a raster of 20 Hz with the inverse alone; with PI feedback; after "
-        f"{passes} passes of learning through a straight line; of `learn`"
+        f"{passes} passes of learning through a straight line; of `learn` (where a mode was not identified, tens of "
+        "nanometres may stay)"
     )
     figures = errors["learner"][0], errors["PI"][-1], errors["line"][-1], errors["learner"][-1]
     said = "; ".join(f"{one:.1f} nm" for one in figures)

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.filters import DAMPING, WIDEST
-from slpi_ros.export.stage import ExportedAxis, ExportedStage
+from slpi_ros.export.stage import HISTORY, ExportedAxis, ExportedStage
 from slpi_ros.hysteresis.shapes import END, FAR
 from slpi_ros.model.limits import MAX_DT
 
@@ -279,6 +279,7 @@ def context_of(stage: ExportedStage) -> Mapping[str, Any]:
         "axes": axes,
         "about": [comment(line) for line in lines],
         "stack_bound": _stack_bound(stage),
+        "history": HISTORY,
         "libm": LIBM,
         "longest": repr(MAX_DT),
         "far": repr(FAR),

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from math import inf, isfinite, isinf
+from math import inf, isfinite, isinf, pi
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +11,7 @@ import numpy as np
 from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import Followed
 from slpi_ros.effects.paths import Laws
+from slpi_ros.effects.resonance import SPACING
 from slpi_ros.effects.surroundings import Surroundings
 from slpi_ros.errors import UsageError
 from slpi_ros.hysteresis.kinds import DESCRIPTIONS, PathModel
@@ -19,9 +20,17 @@ from slpi_ros.hysteresis.multi_slope import STEEP, MultiSlope
 from slpi_ros.hysteresis.shapes import FAR, Branches
 from slpi_ros.hysteresis.turning_points import Memory, MemoryState
 from slpi_ros.model.axis_model import AxisModel
-from slpi_ros.model.limits import Limits
+from slpi_ros.model.limits import MAX_DT, Limits
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.model.streaming import StageStream, accepted_range
+
+# Desired displacements that are kept of each mode, unless SLPI_HISTORY says otherwise.
+HISTORY = 128
+
+
+def resolved(omega: float) -> float:
+    """Return the shortest step (s) of which all desired displacements are kept, for a mode of `omega` (rad/s)."""
+    return 4.0 * SPACING / ((HISTORY - 4) * omega)
 
 
 class Known(NamedTuple):
@@ -211,6 +220,7 @@ class ExportedStage:
         axes = tuple(ExportedAxis(name, axis, limits, others) for name, axis in chosen.items())
         for axis in axes:
             require_numbers(axis)
+            require_resolved(axis)
         return cls(axes, StageModel(chosen, model.hardware_id, model.created))
 
     def stream(self) -> StageStream:
@@ -244,6 +254,17 @@ def _densest(family: LoopFamily) -> float:
     # A cell on the diagonal is a triangle.
     diagonal = np.diag(everett, -1) / (0.5 * cells**2)
     return float(max(np.abs(density[inside]).max(initial=0.0), np.abs(diagonal).max()))
+
+
+def require_resolved(axis: ExportedAxis) -> None:
+    """Raise UsageError if a mode is so slow that the last part of a pause is not resolved."""
+    # A pause is a hold of any length and at most MAX_DT in which the voltage moves.
+    for law in axis.laws.factors:
+        if law[0] > 0.0 and 2.0 * resolved(law[1]) > MAX_DT:
+            raise UsageError(
+                f"axis '{axis.name}': effect 'resonance' has a mode of {law[1] / (2.0 * pi):.3g} Hz, too slow for an "
+                f"export (from {4.0 * SPACING / ((HISTORY - 4) * pi * MAX_DT):.2g} Hz on); leave it out of the model"
+            )
 
 
 def require_numbers(axis: ExportedAxis) -> None:

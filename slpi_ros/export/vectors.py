@@ -10,15 +10,13 @@ from numpy.typing import NDArray
 from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import SlpiError, UnreachableError, UsageError
 from slpi_ros.export.c_source import context_of, templates
-from slpi_ros.export.stage import ExportedStage
+from slpi_ros.export.stage import ExportedStage, resolved
 from slpi_ros.model.streaming import StageStream
 
 # Codes of slpi_inverse.h.
 OK, BAD_TIME, NOT_FINITE, OUT_OF_RANGE, UNREACHABLE = range(5)
-# Number of steps, the usual one (s), and the smallest share of what `SLPI_HISTORY` resolves of a mode.
+# Number of steps, and the usual one (s).
 STEPS, USUAL = 1200, 1e-4
-# Stored displacements of each mode, and how many more a step needs.
-HISTORY = 128
 # Largest difference to the stream of Python, as a share of the voltage range: double; float; float with creep, whose
 # states hardly change in a step. The inverses of lag, rate law and modes multiply rounding errors, and a model without
 # slope jumps: allowed is what setpoints make that are rounded so many times as coarsely as float does.
@@ -57,7 +55,7 @@ def code_of(error: SlpiError) -> int:
 def usual_step(stage: ExportedStage) -> float:
     """Return a step (s), in whole nanoseconds, which resolves all modes."""
     lowest = min((float(row[1]) for axis in stage.axes for row in axis.laws.factors if row[0] > 0.0), default=inf)
-    return max(USUAL, round(1e9 * 4.0 / ((HISTORY - 4) * lowest)) * 1e-9)
+    return max(USUAL, round(1e9 * 2.0 * resolved(lowest)) * 1e-9)
 
 
 def float_goal(stage: ExportedStage) -> float:

@@ -14,8 +14,10 @@ from export.stages import EVERY, KINDS, one_axis, stages, two_axes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from slpi_ros.effects.filters import Mode
 from slpi_ros.effects.hum import Hum, Line
 from slpi_ros.effects.lag import Lag
+from slpi_ros.effects.resonance import Resonance
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.effects.surroundings import Quantity, Surroundings
 from slpi_ros.errors import UsageError
@@ -68,6 +70,20 @@ def test_it_equals_the_stream(model, slew, seed):
 def test_every_kind_with_every_effect(tmp_path, kind):
     stage = ExportedStage.of(one_axis(kind, EVERY), Limits(5.0, 95.0, 2e4))
     assert (differences(stage, tmp_path, *path(stage, 800)) <= AGREES).all()
+
+
+@pytest.mark.parametrize("slew", [inf, 100.0])
+@pytest.mark.parametrize("frequency", [0.06, 1.0, 10.0, 300.0])
+def test_pauses_with_a_slow_mode(tmp_path, frequency, slew):
+    # Of a pause longer than 0.1 s a short part may come first; its displacement is kept, too.
+    stage = ExportedStage.of(one_axis("pi", (Resonance((Mode(frequency, 0.3, 1.0),)),)), replace(FREE, slew=slew))
+    for seed in (1, 2, 3):
+        assert (differences(stage, tmp_path, *path(stage, 1500, seed)) <= AGREES).all()
+
+
+def test_a_mode_that_is_too_slow_is_refused_by_name():
+    with pytest.raises(UsageError, match="0.04 Hz"):
+        ExportedStage.of(one_axis("pi", (Resonance((Mode(0.04, 0.3, 1.0),)),)), FREE)
 
 
 def test_coupled_axes_together(tmp_path):

@@ -26,11 +26,9 @@ from slpi_ros.effects.base import (
     usual_step,
 )
 from slpi_ros.effects.excitation import FEWEST_STEPS, DriveLimits, DrivePath, Excitation, loops, move, remaining
-from slpi_ros.effects.filters import LEAST_GAIN, WIDEST, Mode, StreamingMode, filtered, mode_poles
+from slpi_ros.effects.filters import LEAST_GAIN, SPACING, WIDEST, Mode, StreamingMode, filtered, mode_poles
 from slpi_ros.effects.parameters import as_list, parameter, require
 
-# Smallest spacing of taps, in units of 1 / w: smaller ones make larger taps without benefit.
-SPACING = 0.5
 # A zero is near a mode up to this ratio of the squared frequencies, which is the largest gain of `Exact`.
 NEAR = 10.0
 # Largest number of modes, and the smallest share of the motion beside the modes that is none by rounding.

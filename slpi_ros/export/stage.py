@@ -10,8 +10,8 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import Followed
+from slpi_ros.effects.filters import SPACING
 from slpi_ros.effects.paths import Laws
-from slpi_ros.effects.resonance import SPACING
 from slpi_ros.effects.surroundings import Surroundings
 from slpi_ros.errors import UsageError
 from slpi_ros.hysteresis.kinds import DESCRIPTIONS, PathModel

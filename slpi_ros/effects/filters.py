@@ -24,7 +24,7 @@ LEAST_GAIN = 0.01
 DAMPING = 1 / 8
 # From this step times the frequency (rad/s) on a mode is not resolved, and only its lag is compensated.
 WIDEST = 3.0
-# Smallest spacing of the taps of the inverse of a mode, in units of 1 / w: smaller ones make larger taps without benefit.
+# Smallest spacing of the taps of the inverse of a mode, in units of 1 / w: smaller ones only make larger taps.
 SPACING = 0.5
 
 

@@ -14,7 +14,7 @@ from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
-from slpi_ros.diagnosis.selection import BIAS, CONVERGED, Selection, contenders, is_own, seen, select
+from slpi_ros.diagnosis.selection import BIAS, CONVERGED, Named, Selection, contenders, is_own, seen, select
 from slpi_ros.diagnosis.significance import NO_WORSE, counts
 from slpi_ros.effects.registry import EFFECTS, in_order
 from slpi_ros.errors import SlpiError, UsageError
@@ -35,10 +35,11 @@ REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
 # Effects that leave more than noise are part of the model if they leave at most this share of the error (a third of its
 # mean square), and if the free run of the extended model shows this share of the held-out gain.
 LEFT_OF_ERROR, GAIN_SHOWN = 0.6, 0.5
-# A drift, which may have any course, or a cause with alternatives may stand for a wrong hysteresis: if they leave more
-# than this multiple of the repeatability, at most this share of the error (a tenth of its mean square). At a single
-# drive frequency such a cause only gives the loops another shape, and none that leaves so much is part of the model.
-MUCH_LEFT, LEFT_BY_UNSURE = 3.0, 0.316
+# A drift, which may have any course, or a cause with alternatives may stand for a wrong hysteresis: where more than
+# noise is left, that is at most this share of what is left without it (a tenth of the mean square). At a single drive
+# frequency such a cause only gives the loops another shape, and none that leaves more than this multiple of the
+# repeatability is in the model.
+LEFT_BY_UNSURE, MUCH_LEFT = 0.316, 3.0
 # Gauss-Newton steps of the selected effects with the hysteresis of the given model, which has more vertices; largest
 # ratio of the error of the coarser one to that with it.
 REFINED, COARSER = 3, 1.05
@@ -169,7 +170,7 @@ def _diagnose_axis(
     # Other kinds are not refitted; a comparison with the loop family shows whether they are suitable.
     fitted = model.kind in REFITTED
     family = evidence_of(records, axis, None, start, stop) if model.kind == "pi" else None
-    selection = _selected(base, family if fitted else None)
+    selection = _without_unsure(_selected(base, family if fitted else None))
     runs = [_run(model, part, of_record=same) for part in selection.now.evidence.parts]
     before = base.held_out.rms_of_records if fitted else rms_of(runs)
     if not fitted and before > WRONG_KIND * base.held_out.rms:
@@ -179,7 +180,7 @@ def _diagnose_axis(
     extension = _extension(model, selection, given, source)
     if _of_another_kind(selection) or (extension and _not_as_judged(extension.with_own, runs, selection)):
         # What was judged on held-out blocks is not what all records together give: the causes do not explain them.
-        selection = _without_causes(selection)
+        selection = selection.without({named.name for named in selection.named})
         given = _given(model, runs, selection)
         extension = _extension(model, selection, given, source)
         if extension and _not_as_judged(extension.with_own, runs, selection):
@@ -220,27 +221,40 @@ def _extension(model: AxisModel, selection: Selection, given: Given, source: str
     return _Extension(extended, runs, _runs(extended, selection.now, own=True) if own else runs)
 
 
+def _without_unsure(selection: Selection) -> Selection:
+    """Return the selection without causes that may stand for a wrong hysteresis; the least helpful one goes first."""
+    while left := _much_left(selection):
+        unsure = [named for named in selection.named if _is_unsure(named)]
+        shares = {named.name: left / named.without.rms_of_records for named in unsure}
+        if not shares or max(shares.values()) <= LEFT_BY_UNSURE:
+            break
+        selection = selection.without({max(shares, key=lambda name: shares[name])})
+    return selection
+
+
+def _is_unsure(named: Named) -> bool:
+    return EFFECTS[named.name].free_course or bool(named.alternatives)
+
+
+def _much_left(selection: Selection, multiple: float = ABOVE_NOISE) -> float:
+    """Return what is left (m), 0 if that is at most a multiple of the repeatability."""
+    left = selection.now.held_out.rms_of_records
+    return left if left > multiple * _repeatability(selection.now).rms else 0.0
+
+
 def _of_another_kind(selection: Selection) -> bool:
     """Return whether the effects leave so much that the physics is another, where they would not carry over."""
-    if not selection.named:
+    if not selection.named or not _much_left(selection):
         return False
-    unsure = any(EFFECTS[named.name].free_course or named.alternatives for named in selection.named)
-    left, repeats = selection.now.held_out.rms_of_records, _repeatability(selection.now).rms
-    if unsure and left > MUCH_LEFT * repeats:
-        return one_speed(selection.now.evidence) or _share_left(selection) > LEFT_BY_UNSURE
-    return left > ABOVE_NOISE * repeats and _share_left(selection) > LEFT_OF_ERROR
+    if _share_left(selection) > LEFT_OF_ERROR:
+        return True
+    unsure = any(_is_unsure(named) for named in selection.named)
+    return unsure and one_speed(selection.now.evidence) and _much_left(selection, MUCH_LEFT) > 0.0
 
 
 def _share_left(selection: Selection) -> float:
     """Return the share of the held-out error that the effects leave."""
     return selection.now.held_out.rms_of_records / selection.named[0].before.rms_of_records
-
-
-def _without_causes(selection: Selection) -> Selection:
-    """Return the selection without the selected effects, which are reported as dropped."""
-    causes = {named.name for named in selection.named}
-    now = selection.now.only([effect.name for effect in selection.now.effects if effect.name not in causes])
-    return replace(selection, now=now, named=(), dropped=tuple(sorted({*selection.dropped, *causes})))
 
 
 def _runs(model: AxisModel, now: Explanation, *, own: bool = False) -> list[FreeRun]:
@@ -266,7 +280,7 @@ def _not_as_judged(after: Sequence[FreeRun], runs: Sequence[FreeRun], selection:
     shown = 1.0 - rms_of(after) / rms_of(runs)
     if not selection.named or shown >= GAIN_SHOWN * (1.0 - _share_left(selection)):
         return False
-    return selection.now.held_out.rms_of_records > ABOVE_NOISE * _repeatability(selection.now).rms
+    return _much_left(selection) > 0.0
 
 
 def _selected(base: Explanation, of_family: Evidence | None) -> Selection:

@@ -1,7 +1,7 @@
 """Forward selection of effects: the one that best explains the residual is added if its gain is significant."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -312,6 +312,16 @@ class Selection:
     trials: float = 1.0
     # The effect that was added first, and the others that had a significant gain then, the best one first.
     beginnings: tuple[Effect, ...] = ()
+    # Of each named effect those that may stand in its place.
+    rivals: Mapping[str, Sequence[Effect]] = field(default_factory=dict)
+
+    def without(self, names: Collection[str]) -> "Selection":
+        """Return the selection without some of its effects, which count as dropped."""
+        now = self.now.only([effect.name for effect in self.now.effects if effect.name not in names])
+        if left := {name: rivals for name, rivals in self.rivals.items() if name not in names}:
+            now = now.refined(CONVERGED)
+        named = _named(now.only([effect.name for effect in now.effects if effect.name not in left]), now, left)
+        return replace(self, now=now, named=named, dropped=tuple(sorted({*self.dropped, *names})), rivals=left)
 
 
 def select(base: Explanation, family: Explanation | None) -> Selection:
@@ -386,7 +396,8 @@ def _grown(base: Explanation, family: Explanation | None, beginnings: tuple[Effe
     now = _without_needless(_plainer(now.refined(CONVERGED), rivals), set(rivals), restart=False)
     named = _named(start, now, rivals)
     dropped -= {one.name for one in named}
-    return Selection(base, now, named, structures, tuple(sorted(dropped)), trials, beginnings)
+    kept = {one.name: rivals[one.name] for one in named}
+    return Selection(base, now, named, structures, tuple(sorted(dropped)), trials, beginnings, kept)
 
 
 def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:

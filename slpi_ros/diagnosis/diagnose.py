@@ -290,9 +290,12 @@ def _selected(base: Explanation, of_family: Evidence | None) -> Selection:
     if quick and quick.held_out.rms <= COARSER * base.held_out.rms:
         selection = _of_kind(quick, of_family.coarse if of_family else None)
         finest = of_family if of_family and BIAS in selection.structures else evidence
-        now = Explanation(replace(selection.now.evidence, basis=finest.basis), selection.now.effects).refined(REFINED)
+        # A smoothness that suits few vertices may leave many without any hold.
+        finer = replace(selection.now.evidence, basis=finest.basis, smoothness=evidence.smoothness)
+        now = Explanation(finer, selection.now.effects).smoothed().refined(REFINED)
         if selection.now.held_out.rms <= COARSER * now.held_out.rms:
-            return replace(selection, base=base, now=now)
+            as_good = now.held_out.rms <= COARSER * selection.now.held_out.rms
+            return replace(selection, base=base, now=now) if as_good else selection
     return _of_kind(base, of_family)
 
 

@@ -16,6 +16,7 @@ from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
 from slpi_ros.diagnosis.selection import BIAS, CONVERGED, Named, Selection, contenders, is_own, seen, select
 from slpi_ros.diagnosis.significance import NO_WORSE, counts
+from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.registry import EFFECTS, in_order
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
@@ -201,7 +202,7 @@ def _diagnose_axis(
 class _Extension(NamedTuple):
     """Refitted model, and its free run on each record.
 
-    `with_own` are its free runs with what belongs to each record, such as drift, by which the causes are judged.
+    `with_own` are its free runs with the effects of each record, such as drift, by which the causes are judged.
     """
 
     model: AxisModel
@@ -260,13 +261,18 @@ def _share_left(selection: Selection) -> float:
 def _runs(model: AxisModel, now: Explanation, *, own: bool = False) -> list[FreeRun]:
     """Return the free run of an extended model on each of its records, as the effects began there.
 
-    With `own`, also with what is added to the displacement in each record, such as drift.
+    With `own`, also with the effects of each record, such as drift.
     """
     separate: list[Any] = [effect for effect in now.effects if isinstance(effect, EachRecord)]
-    added = [one.parts for one in separate if own and one.parts[0].side == "record"]
     runs = []
     for k, part in enumerate(now.evidence.parts):
-        effects = [*(effect.of_record(k) for effect in model.effects), *(parts[k] for parts in added)]
+        added = [each.parts[k] for each in separate if own]
+        # An error of the sensor goes with its reading, whose zero is not that of the model.
+        for effect in added:
+            if effect.side == "sensor":
+                part = replace(part, y=effect.invert(part.y, EffectContext(part.t)))
+        inside = [effect for effect in added if effect.side != "sensor"]
+        effects = [*(effect.of_record(k) for effect in model.effects), *inside]
         runs.append(_run(replace(model, effects=in_order(effects)), part, of_record=True))
     return runs
 

@@ -15,7 +15,7 @@ from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
 from slpi_ros.diagnosis.selection import BIAS, CONVERGED, Named, Selection, contenders, is_own, seen, select
-from slpi_ros.diagnosis.significance import NO_WORSE, counts
+from slpi_ros.diagnosis.significance import counts, worse_on_none
 from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.registry import EFFECTS, in_order
 from slpi_ros.errors import SlpiError, UsageError
@@ -225,7 +225,9 @@ def _extension(model: AxisModel, selection: Selection, given: Given, source: str
 def _without_unsure(selection: Selection) -> Selection:
     """Return the selection without causes that may stand for a wrong hysteresis; the least helpful one goes first."""
     while left := _much_left(selection):
-        unsure = [named for named in selection.named if _is_unsure(named)]
+        # Of several records, a common effect has held on those that are left out.
+        one = len(selection.now.evidence.parts) == 1
+        unsure = [named for named in selection.named if _is_unsure(named) and (one or named.own)]
         shares = {named.name: left / named.without.rms_of_records for named in unsure}
         if not shares or max(shares.values()) <= LEFT_BY_UNSURE:
             break
@@ -281,7 +283,7 @@ def _not_as_judged(after: Sequence[FreeRun], runs: Sequence[FreeRun], selection:
     """Return whether the free runs `after` of an extended model show another gain than the held-out error."""
     # They may be worse than those of the given model, `runs`, on none of the records. Where the effects leave more than
     # what does not repeat, they also show at least `GAIN_SHOWN` of their held-out gain.
-    if any(one.rms > NO_WORSE * given.rms for one, given in zip(after, runs, strict=True)):
+    if not worse_on_none(np.array([run.rms**2 for run in runs]), np.array([run.rms**2 for run in after])):
         return True
     shown = 1.0 - rms_of(after) / rms_of(runs)
     if not selection.named or shown >= GAIN_SHOWN * (1.0 - _share_left(selection)):

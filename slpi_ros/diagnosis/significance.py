@@ -19,8 +19,9 @@ LARGE_GAIN, CHANCE_OF_LARGE_GAIN = 0.3, 0.05
 SURROGATES, TAIL = 1999, 0.05
 # Lower bound of losses, for records without noise (m^2), and smallest p-value.
 TINY, LEAST_CHANCE = 1e-30, 1e-12
-# Largest accepted ratio of the error with an effect to that without it, on any held-out record.
-NO_WORSE = 1.05
+# Largest accepted ratio of the error with an effect to that without it, on any held-out record; and largest rise of its
+# mean square there, as a share of the fall of the mean square of all: what is left may be divided otherwise.
+NO_WORSE, RISE = 1.05, 0.05
 
 
 def chance_of_gain(before: Score, after: Score, trials: float = 1.0) -> float:
@@ -79,21 +80,18 @@ def gain(before: Score, after: Score) -> float:
 
 def carries_over(before: Score, after: Score) -> bool:
     """Return whether the error falls on each held-out record, or clearly on all together; True for one record."""
-    # Clearly: by `LEAST_GAIN`, and it rises to `NO_WORSE` times on none.
-    ratio = _ratio_on_records(before, after)
-    if ratio.size == 0 or float(ratio.max()) < 1.0:
+    # Clearly: by `LEAST_GAIN`, and it is worse on none.
+    both = np.isfinite(before.records) & np.isfinite(after.records)
+    if before.records.size == 0 or not both.any() or (after.records[both] < before.records[both]).all():
         return True
     less = after.rms_of_records <= (1.0 - LEAST_GAIN) * before.rms_of_records
-    return float(ratio.max()) <= NO_WORSE and less
+    return less and worse_on_none(before.records[both], after.records[both])
 
 
-def _ratio_on_records(before: Score, after: Score) -> FloatArray:
-    """Return the ratio of the errors, after / before, on each held-out record for which both are known."""
-    if not before.records.size:
-        return np.empty(0)
-    both = np.isfinite(before.records) & np.isfinite(after.records)
-    ratio: FloatArray = np.sqrt(after.records[both] / np.maximum(before.records[both], TINY))
-    return ratio
+def worse_on_none(before: FloatArray, after: FloatArray) -> bool:
+    """Return whether mean squares (m^2, (records,)) rise on no record, but for little of what all fall by."""
+    fall = float(np.mean(before - after))
+    return bool(np.all((after <= NO_WORSE**2 * before) | (after - before <= RISE * fall)))
 
 
 def counts(before: Score, after: Score, *, own: bool = True, least: float = LEAST_GAIN, trials: float = 1.0) -> bool:

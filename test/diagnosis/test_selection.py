@@ -17,6 +17,7 @@ from slpi_ros.diagnosis.significance import (
     counts,
     gain,
     independent_trials,
+    worse_on_none,
 )
 
 BLOCKS = 12
@@ -69,6 +70,13 @@ def test_a_gain_on_each_record_that_was_left_out_carries_over(share, expected):
 def test_a_gain_that_chance_gives_does_not_count():
     before, after = score(1e-8, spread=0.5, seed=1), score(0.9e-8, spread=0.5, seed=2)
     assert gain(before, after) > LEAST_GAIN and not counts(before, after)
+
+
+@pytest.mark.parametrize(("rise", "expected"), [(0.04, True), (0.06, False)])
+def test_one_record_may_rise_by_a_twentieth_of_what_all_fall_by(rise, expected):
+    before = np.array([1.0, 1.0, 400.0])
+    fall = 360.0 / 3.0
+    assert worse_on_none(before, np.array([1.0, 1.0 + rise * fall, 400.0 - 360.0 - rise * fall])) is expected
 
 
 @pytest.mark.parametrize(("other", "expected"), [(1.01e-9, True), (9e-9, False)])

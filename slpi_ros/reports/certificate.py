@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from slpi_ros.diagnosis.verify import RecordVerification, Verification
+from slpi_ros.diagnosis.verify import PASSED, UNPROVED, RecordVerification, Verification
 from slpi_ros.errors import SlpiError, length
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.io.digests import digests
@@ -55,7 +55,7 @@ def certificate(of: Verified) -> dict[str, Any]:
         "schema": SCHEMA,
         "hardware_id": found.hardware_id or next((each.hardware_id for each in of.records if each.hardware_id), ""),
         "issued": datetime.now(UTC).isoformat(timespec="seconds"),
-        "verdict": found.verdict,
+        "verdict": _proved(found.verdict, of),
         "tolerance_m": found.tolerance,
         "method": list(METHOD),
         "model": {"source": of.model_file, "sha256": digest, "created": of.model.created},
@@ -65,7 +65,7 @@ def certificate(of: Verified) -> dict[str, Any]:
         ],
         "axes": {
             name: {
-                "verdict": axis.verdict,
+                "verdict": _proved(axis.verdict, of),
                 **_model(of.model.axes[name]),
                 "rms_m": axis.overall.rms,
                 "maximum_m": axis.overall.maximum,
@@ -82,6 +82,11 @@ def certificate(of: Verified) -> dict[str, Any]:
         },
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in PROGRAMS}},
     }
+
+
+def _proved(verdict: str, of: Verified) -> str:
+    """Return the verdict, `UNPROVED` instead of `PASSED` where the model was identified from all records."""
+    return UNPROVED if verdict == PASSED and set(of.bags) <= set(of.own) else verdict
 
 
 def write_files(folder: Path, document: dict[str, Any]) -> None:

@@ -96,6 +96,7 @@ def test_a_record_of_the_model_proves_nothing(folder, verify):
     verify("--model", "own.json", "--certificate", "-o", "own")
     document = json.loads((folder / "own" / "certificate.json").read_text())
     assert not document["records"][0]["independent"]
+    assert document["verdict"] == document["axes"]["x"]["verdict"] == "unproved"
     assert "proves nothing on today" in (folder / "own" / "certificate.html").read_text()
 
 

@@ -127,6 +127,7 @@ def seen(now: Explanation) -> FitContext:
         excited_frequency=lambda: excited_frequency(evidence),
         drives=drives,
         zeros=lambda: now.zeros,
+        left_without=lambda name: now.y - now.prediction_without(name),
         records=now.around.records,
     )
 

@@ -533,10 +533,12 @@ class FitContext:
     rounding: float
     effects: Sequence[Effect]
     # Return the highest frequency (Hz) that any record excites; of each record the single drive frequency (Hz), 0 if
-    # there are several, and the duration (s); the displacement (m) at the centre of the largest loop of each record.
+    # there are several, and the duration (s); the displacement (m) at the centre of the largest loop of each record;
+    # and what would be left (m) without the effect of a name, everything else unchanged.
     excited_frequency: Callable[[], float]
     drives: Callable[[], Sequence[tuple[float, float]]]
     zeros: Callable[[], FloatArray]
+    left_without: Callable[[str], FloatArray]
     # Contexts of the records that the signals are concatenated from; empty for a single record.
     records: tuple[EffectContext, ...] = ()
 
@@ -549,7 +551,11 @@ class FitContext:
         t, v, u, h, y = (x[own] for x in (self.t, self.v, self.u, self.h, self.y))
         drives, zeros = (lambda: [self.drives()[k]]), (lambda: self.zeros()[k : k + 1])
         effects, excited = self.effects, self.excited_frequency
-        return FitContext(t, v, u, h, y, self.used[own], self.rounding, effects, excited, drives, zeros)
+
+        def left_without(name: str) -> FloatArray:
+            return self.left_without(name)[own]
+
+        return FitContext(t, v, u, h, y, self.used[own], self.rounding, effects, excited, drives, zeros, left_without)
 
     @property
     def step(self) -> float:

@@ -65,7 +65,7 @@ class Steps(EffectBase):
     def plausible(self, context: FitContext) -> bool:
         """Return whether all jumps are sudden, and not where the voltage turns or jumps by more than chance."""
         places = np.searchsorted(context.t, self.times)
-        left = np.interp(context.t, context.t[context.used], (context.y - context.h)[context.used])
+        left = np.interp(context.t, context.t[context.used], context.left_without(self.name)[context.used])
         pairs = zip(places.tolist(), self.sizes, strict=True)
         return all(sudden(left, k, size) for k, size in pairs) and not follows_drive(places, context.v)
 

@@ -24,9 +24,11 @@ def noisy(x, seed=0):
     return x + NOISE * np.random.default_rng(seed).standard_normal(x.size)
 
 
-def view(y):
+def view(y, more=0.0):
+    """A fit that leaves `y` without jumps, where other effects have `more` than the hysteresis."""
     h, used = 2e-7 * V, np.ones(T.size, dtype=bool)
-    return FitContext(T, V, V, h, h + y, used, 1e-10, (), lambda: 0.7, lambda: [(0.7, 20.0)], lambda: np.zeros(1))
+    zeros, left = (lambda: np.zeros(1)), (lambda name: y)
+    return FitContext(T, V, V, h, h + y + more, used, 1e-10, (), lambda: 0.7, lambda: [(0.7, 20.0)], zeros, left)
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -55,6 +57,8 @@ def test_the_candidates_hold_ever_more_jumps():
 
 def test_jumps_are_plausible_if_sudden_and_where_the_voltage_does_not_turn():
     assert JUMPS.plausible(view(noisy(JUMPS.path(T))))
+    # What another effect explains, such as ringing, does not blur them.
+    assert JUMPS.plausible(view(noisy(JUMPS.path(T)), 100 * NOISE * np.sin(2 * np.pi * 90.0 * T)))
     ramp = np.interp(T, (9.0, 10.0), (0.0, 10 * NOISE))
     assert not Steps((9.5,), (10 * NOISE,)).plausible(view(noisy(ramp)))
     turns = Steps(tuple(k / 1.4 + 5e-4 for k in range(1, 6)), tuple(10 * NOISE * (-1) ** k for k in range(5)))

@@ -63,6 +63,11 @@ class EachRecord(EffectBase):
         found = tuple(part for part in parts if part is not None)
         return EachRecord(found) if len(found) == len(parts) else None
 
+    @property
+    def courses(self) -> tuple[tuple[float, ...], ...]:
+        """Values at the knots of each record, of an effect with a free course."""
+        return tuple(course for part in self.parts for course in part.courses)
+
     def plausible(self, view: FitContext) -> bool:
         """Return whether the parameters of each record are plausible."""
         return all(part.plausible(view.of_record(k)) for k, part in enumerate(self.parts))

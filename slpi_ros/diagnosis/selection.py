@@ -21,7 +21,7 @@ from slpi_ros.diagnosis.significance import (
     gain,
     independent_trials,
 )
-from slpi_ros.effects.base import Candidate, Effect, FitContext, usual_step
+from slpi_ros.effects.base import Candidate, Effect, FitContext, is_course, usual_step
 from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.reversals import monotone_runs
@@ -132,6 +132,11 @@ def seen(now: Explanation) -> FitContext:
     )
 
 
+def is_plausible(effect: Effect, now: Explanation) -> bool:
+    """Return whether an effect of a joint fit, or one to be added, may be what it is called."""
+    return is_course(*effect.courses) and effect.plausible(seen(now))
+
+
 def least_gain(name: str, beside: Explanation) -> float:
     """Return the smallest relative reduction of the held-out error by an effect beside those of a joint fit."""
     if any(other.resembles_when_old == name for other in beside.effects):
@@ -160,16 +165,16 @@ def contenders(now: Explanation, names: Iterable[str] | None = None) -> list[Con
     trials = independent_trials(now.held_out, scores)
     error = now.held_out.rms
     # Implausible effects do not determine the threshold.
-    most = max((error - score.rms for score, effect in screened if effect.plausible(seen(now))), default=0.0)
+    most = max((error - score.rms for score, effect in screened if is_plausible(effect, now)), default=0.0)
     least = max(WORTH_TRYING * most, LEAST_SCREENED * error)
     tried = [
         Contender(effect.name, _with_companion(now, effect).adding(effect), trials).refined(1)
         for score, effect in screened
         if error - score.rms > least
     ]
-    sound = [one for one in tried if one.effect.plausible(seen(one.explanation))]
+    sound = [one for one in tried if is_plausible(one.effect, one.explanation)]
     most = max((error**2 - one.score.rms**2 for one in sound), default=0.0)
-    sound = [one for one in _refined(tried, now, most) if one.effect.plausible(seen(one.explanation))]
+    sound = [one for one in _refined(tried, now, most) if is_plausible(one.effect, one.explanation)]
     # Of an effect that was refined from several forms, the best.
     sound = [min((one for one in sound if one.name == name), key=_error) for name in {one.name: None for one in sound}]
     # What has to prove itself beside other signals, and does not, stands for these, and is no rival of anything.
@@ -422,7 +427,7 @@ def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
                 one for one in contenders(without, [name]) if one.counts_beside(without) and not one.effect.at_bound
             ]
             now = anew[0].explanation if anew else without
-        elif effect.at_bound or not effect.plausible(seen(now)):
+        elif effect.at_bound or not is_plausible(effect, now):
             refused.add(name)
             now = _without(name, now, rivals, refused)
     # Of several records, that an effect holds on those that are left out says more than its standard deviations, which
@@ -505,7 +510,7 @@ def _exchanged(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation
         rest, best = now.without(name), Contender(name, now)
         better = [
             one
-            for one in _tried(name, now, rest, rivals[name])
+            for one in (*_tried(name, now, rest, rivals[name]), *_other_courses(name, now, rest))
             if one.counts_beside(rest)
             and (
                 one.rms < (1.0 - LEAST_FALL) * best.rms
@@ -519,13 +524,21 @@ def _exchanged(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation
     return now
 
 
+def _other_courses(name: str, now: Explanation, rest: Explanation) -> list[Contender]:
+    """Return the other effects with a free course in place of one; `rest` is the fit without it."""
+    # When it was selected, others that were missing may have hidden which of them it is.
+    present = {effect.name for effect in now.effects}
+    free_courses = [other for other, effect in EFFECTS.items() if effect.free_course]
+    return contenders(rest, [other for other in free_courses if other not in present]) if name in free_courses else []
+
+
 def _tried(name: str, now: Explanation, rest: Explanation, rivals: Sequence[Effect]) -> list[Contender]:
     """Return the plausible rivals of an effect in its place, the best one first; `rest` is the fit without it."""
     present = {effect.name for effect in now.effects}
     absent = {rival.name: rival for rival in rivals if rival.name not in present}
     tried = [Contender(other, now.replacing(name, rival).refined(1)) for other, rival in absent.items()]
     refined = _refined(tried, rest, rest.held_out.rms**2 - now.held_out.rms**2)
-    return sorted((one for one in refined if one.effect.plausible(seen(one.explanation))), key=_error)
+    return sorted((one for one in refined if is_plausible(one.effect, one.explanation)), key=_error)
 
 
 def _best_structure(now: Explanation, taken: tuple[str, ...]) -> tuple[str | None, Explanation]:

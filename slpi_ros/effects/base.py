@@ -276,6 +276,11 @@ class EffectBase(Protocol):
         others = any(other.time_shift != "none" and other.name != self.name for other in context.effects)
         return self.time_shift != "only" or not others or abs(self.slow_shift) > HELD * context.step
 
+    @property
+    def courses(self) -> tuple[tuple[float, ...], ...]:
+        """Values at the knots of an effect with a free course, record by record; else none."""
+        return ()
+
     def in_phase(self, context: "FitContext") -> bool:
         """Return whether one set of parameters can hold for all records of a fit, and for others."""
         return True
@@ -590,15 +595,15 @@ def longest(around: EffectContext) -> float:
     return max(float(t[-1] - t[0]) for t in around.split(around.t))
 
 
-def is_course(knots: Sequence[float]) -> bool:
+def is_course(*records: Sequence[float]) -> bool:
     """Return whether the values at knots are those of a slow change that the knots resolve, not up and down by turns.
 
-    Von Neumann's ratio of the mean square of successive differences to twice the variance: 1 for independent values.
+    Von Neumann's ratio of the mean square of successive differences to twice the variance: 1 for independent values; of
+    all records together, as in some nothing may change.
     """
-    if len(knots) < FEWEST_KNOTS:
-        return True
-    values = np.asarray(knots)
-    return bool(np.sum(np.diff(values) ** 2) <= 2.0 * LARGEST_RATIO * np.sum((values - values.mean()) ** 2))
+    values = [np.asarray(knots) for knots in records if len(knots) >= FEWEST_KNOTS]
+    turns = sum(float(np.sum(np.diff(own) ** 2)) for own in values)
+    return turns <= 2.0 * LARGEST_RATIO * sum(float(np.sum((own - own.mean()) ** 2)) for own in values)
 
 
 def wave(phase: FloatArray) -> FloatArray:

@@ -19,7 +19,6 @@ from slpi_ros.effects.base import (
     Signal,
     StreamingBase,
     Unsure,
-    is_course,
 )
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter, require
@@ -86,10 +85,14 @@ class GainDrift(EffectBase):
             ("gains", len(self.gains) == len(self.times), "one for each time"),
         )
 
+    @property
+    def courses(self) -> tuple[tuple[float, ...], ...]:
+        """Changes of the gain at the knots."""
+        return (self.gains,)
+
     def plausible(self, context: FitContext) -> bool:
-        """Return whether it is small, slow and resolved by its knots, with an origin near the displacements."""
-        near, slow = context.near_motion(self.origin), self.times[-1] >= TAKES and is_course(self.gains)
-        return near and slow and max(map(abs, self.gains)) <= LARGEST
+        """Return whether it is small and slow, with an origin near the displacements."""
+        return context.near_motion(self.origin) and self.times[-1] >= TAKES and max(map(abs, self.gains)) <= LARGEST
 
     def factor(self, t: FloatArray) -> FloatArray:
         """Return ``1 + g``, shape (N,), at times `t`, shape (N,), seconds from the record's start."""

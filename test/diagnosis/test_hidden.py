@@ -89,6 +89,24 @@ def with_reading(hidden, reading):
     return dataclasses.replace(hidden.record, displacement={"x": reading + noise})
 
 
+@pytest.mark.long
+@pytest.mark.parametrize(
+    ("seed", "names"),
+    [
+        # What few vertices explain is refitted with more of them, which need a smoothness of their own.
+        pytest.param(7301, ("lag", "resonance"), id="more vertices"),
+        # The jumps are sudden beside the ringing, and hidden in it.
+        pytest.param(7500, ("resonance", "steps"), id="jumps of a stage that rings"),
+    ],
+)
+def test_two_that_hide_each_other(seed, names):
+    hidden = hide(seed, names, samples=40_000)
+    axis = hidden.truth[0].axis
+    found = slpi_ros.diagnose(hidden.record, slpi_ros.identify(hidden.record), axes=[axis]).axes[axis]
+    assert found.verdict == "named" and {effect.name for effect in found.effects} == set(names)
+    assert found.after_rms < 1.3 * hidden.floor[axis]
+
+
 def test_lines_are_found_one_by_one_and_are_one_effect():
     hidden = hide(3, axes=1, base="preisach", samples=SAMPLES)
     t, floor = hidden.record.t, hidden.floor["x"]

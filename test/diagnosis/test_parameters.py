@@ -7,10 +7,12 @@ import pytest
 from effects.cases import EVERY
 from hypothesis import given
 
-from slpi_ros.diagnosis.effect_parameters import bounded, certain, free, moved, names, of_starts, steps
+from slpi_ros.diagnosis.effect_parameters import EachRecord, bounded, certain, free, moved, names, of_starts, steps
+from slpi_ros.effects.base import is_course
 from slpi_ros.effects.parameters import facts_of
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.registry import EFFECTS
+from slpi_ros.effects.thermal_drift import ThermalDrift
 
 T, V = np.linspace(0, 10, 1001), np.linspace(0, 100, 1001)
 
@@ -56,3 +58,13 @@ def test_every_field_but_the_uncertainty_is_a_parameter_with_facts(name):
     facts = facts_of(EFFECTS[name])
     assert {*facts, "uncertainty"} == {each.name for each in fields(EFFECTS[name])}
     assert all(each.meaning and each.count[0] <= each.count[1] for each in facts.values())
+
+
+@pytest.mark.parametrize(("first", "expected"), [(1e-6, True), (0.0, False)])
+def test_a_course_is_that_of_all_records_together(first, expected):
+    # In the second one nothing is left of it but noise, which goes up and down by turns.
+    noise = tuple((1e-9 * np.array([1.0, -1.0, 1.0, -1.0, 1.0])).tolist())
+    slow = tuple((first * np.linspace(0.0, 1.0, 5) + 1e-9 * np.array([1.0, -1.0, 1.0, -1.0, 1.0])).tolist())
+    times = (0.0, 10.0, 20.0, 30.0, 40.0)
+    both = EachRecord((ThermalDrift(times, slow), ThermalDrift(times, noise)))
+    assert is_course(*both.courses) is expected

@@ -16,6 +16,7 @@ from refusals import holds
 
 import slpi_ros
 from slpi_ros.cli import MOST_LINES
+from slpi_ros.effects.surroundings import Quantity, Surroundings
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.tables import read_table, write_table
@@ -253,6 +254,22 @@ def test_unreachable_displacements_are_held_and_told(folder, tmp_path):
     assert done.returncode == 0 and "µm/s, the record" in done.stderr
     _, v = read_table(tmp_path / "v.csv", "V")
     assert v["x"].max() <= 100.0
+
+
+def test_a_temperature_beyond_the_record_is_told(folder, tmp_path):
+    model = slpi_ros.load_model(folder / "pi.json")
+    warm = Quantity("/room/temperature", "", 21.0, 4e-7, 0.0, 0.0, lowest=20.0, highest=23.0)
+    axis = replace(model.axes["x"], effects=(Surroundings((warm,)),))
+    slpi_ros.save_model(replace(model, axes={"x": axis}), tmp_path / "warm.json")
+    t, (low, high) = np.arange(200) / 100, axis.displacement_range
+    for name, end, told in (("inside", 22.5, ""), ("beyond", 40.0, "goes from 21 to 40, in the record of the model")):
+        rows = np.column_stack([t, low + (high - low) * np.linspace(0.4, 0.5, t.size), np.linspace(21.0, end, t.size)])
+        lines = ["time_s,x_m,/room/temperature", *(",".join(map(repr, row)) for row in rows.tolist())]
+        (tmp_path / f"{name}.csv").write_text("\n".join(lines))
+        done = slpi("compensate", tmp_path / "warm.json", tmp_path / f"{name}.csv", "-o", tmp_path / f"{name}_v.csv")
+        assert done.returncode == 0 and told in done.stderr and bool(done.stderr) == bool(told)
+    done = slpi("compensate", tmp_path / "warm.json", folder / "desired.csv", "-o", tmp_path / "v.csv")
+    assert "/room/temperature is not known and taken as 21" in done.stderr
 
 
 def test_voltage_limits_of_a_command(folder, tmp_path):

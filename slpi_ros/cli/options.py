@@ -146,10 +146,13 @@ def add_with(command: ArgumentParser, default: str) -> None:
     )  # fmt: skip
 
 
-def left_out(model: "StageModel", surroundings: "Mapping[str, FloatArray]") -> list[str]:
-    """Return a remark on the quantities that a model follows and a table lacks."""
-    missing = [key for key in model.quantities if key not in surroundings]
-    return [f"no column {', '.join(missing)}: taken as its reference value"] if missing else []
+def quantities_beyond(model: "StageModel", t: "FloatArray", surroundings: "Mapping[str, FloatArray]") -> list[str]:
+    """Return remarks on the quantities that a model follows and a table lacks, or has beyond what was recorded."""
+    from slpi_ros.model.coverage import surroundings_beyond
+
+    courses = {key: (t, values) for key, values in surroundings.items()}
+    told = [surroundings_beyond(axis.surrounded(courses), t) for axis in model.axes.values()]
+    return [one for one in dict.fromkeys(told) if one]
 
 
 def source_of(options: Namespace) -> "Source":

@@ -26,7 +26,7 @@ def _run(options: Namespace) -> Result:
     t, voltage, surroundings = read_table_with(options.table, "V", model.quantities)
     known = common.model_columns(voltage, model, options.table)
     options.remarks += allow_table(options.output, table_header(known, "m"), overwrite=options.overwrite)
-    options.remarks += common.left_out(model, surroundings)
+    options.remarks += common.quantities_beyond(model, t, surroundings)
     reached = model.simulate(t, known, surroundings)
     write_table(options.output, t, reached, "m")
     for axis, v in known.items():

@@ -212,7 +212,7 @@ def characters(count: int, first: int, keep: bool) -> None:
         )
         error = np.median([row.error.rest / row.error.stroke for row in rows])
         fixed = np.median([row.fixed.rest / row.fixed.stroke for row in rows])
-        said = f"{whole} of {len(stages)}; {error:.3%}; {fixed:.2%}"
+        said = f"{whole} of {len(stages)}; {100.0 * error:.3f} %; {100.0 * fixed:.2f} %"
         kept.write_row("calibrator", what, said, "make bench-calibrator")
 
 

@@ -43,8 +43,9 @@ MEANT = {
     "single": "simulated stages with one hidden effect: that one named or among the alternatives, and no other",
     "pair": "with two",
     "simulator": "with creep and a lag, by the package's own simulator",
-    "clean": "with none",
-    "unknown": f"with one of {len(KINDS)} causes that no effect describes",
+    "clean": "with none: any name",
+    "unknown": f"simulated stages with one of {len(KINDS)} causes that no effect describes: a wrong name, or silence "
+    "on what is left",
 }
 # Group "simulator": the simulated stage of the package and its default calibration drive (s, Hz), sensor noise (m), lag
 # (s), and smallest and largest creep per decade of time (share of the displacement).
@@ -275,7 +276,7 @@ def main() -> None:
             own = [one for one in outcomes if one.case.group == group]
             bad = sum(one.wrong or one.silent or bool(one.failure) for one in own)
             said = f"{sum(one.right for one in own)} of {len(own)}; {bad} wrong or silent"
-            said = f"{bad} of {len(own)} wrong or silent" if group in ("clean", "unknown") else said
+            said = f"{bad} of {len(own)}" if group in ("clean", "unknown") else said
             kept.write_row(f"confusion {group}", f"diagnosis, {MEANT[group]}", said, "make bench-confusion")
     table(sorted(outcomes, key=lambda one: (GROUPS.index(one.case.group), one.case.hidden, one.case.seed)))
 

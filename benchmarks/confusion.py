@@ -41,9 +41,9 @@ SAMPLES = 40_000
 # What the groups are, in README.
 MEANT = {
     "single": "simulated stages with one hidden effect: that one named or among the alternatives, and no other",
-    "pair": "with two",
-    "simulator": "with creep and a lag, by the package's own simulator",
-    "clean": "with none: any name",
+    "pair": "simulated stages with two hidden effects: both named or among the alternatives, and no other",
+    "simulator": "stages of the package's own simulator with creep and a lag: the same",
+    "clean": "simulated stages without a hidden effect: any name",
     "unknown": f"simulated stages with one of {len(KINDS)} causes that no effect describes: a wrong name, or silence "
     "on what is left",
 }

@@ -42,7 +42,7 @@ LEFT_OF_ERROR, GAIN_SHOWN = 0.6, 0.5
 # repeatability is in the model.
 LEFT_BY_UNSURE, MUCH_LEFT = 0.316, 3.0
 # Gauss-Newton steps of the selected effects with the hysteresis of the given model, which has more vertices; largest
-# ratio of the error of the coarser one to that with it.
+# ratio, either way, of the errors of the coarser one and with it that are as good.
 REFINED, COARSER = 3, 1.05
 # A zero has moved if its shift exceeds this multiple of the error; number of parts for the uncertainty of a gain;
 # fewest samples of a comparison.
@@ -224,10 +224,11 @@ def _extension(model: AxisModel, selection: Selection, given: Given, source: str
 
 def _without_unsure(selection: Selection) -> Selection:
     """Return the selection without causes that may stand for a wrong hysteresis; the least helpful one goes first."""
-    while left := _much_left(selection):
+    while _leaves_more(selection, ABOVE_NOISE):
         # Of several records, a common effect has held on those that are left out.
         one = len(selection.now.evidence.parts) == 1
         unsure = [named for named in selection.named if _is_unsure(named) and (one or named.own)]
+        left = selection.now.held_out.rms_of_records
         shares = {named.name: left / named.without.rms_of_records for named in unsure}
         if not shares or max(shares.values()) <= LEFT_BY_UNSURE:
             break
@@ -239,20 +240,19 @@ def _is_unsure(named: Named) -> bool:
     return EFFECTS[named.name].free_course or bool(named.alternatives)
 
 
-def _much_left(selection: Selection, multiple: float = ABOVE_NOISE) -> float:
-    """Return what is left (m), 0 if that is at most a multiple of the repeatability."""
-    left = selection.now.held_out.rms_of_records
-    return left if left > multiple * _repeatability(selection.now).rms else 0.0
+def _leaves_more(selection: Selection, multiple: float) -> bool:
+    """Return whether more than a multiple of the repeatability is left."""
+    return selection.now.held_out.rms_of_records > multiple * _repeatability(selection.now).rms
 
 
 def _of_another_kind(selection: Selection) -> bool:
     """Return whether the effects leave so much that the physics is another, where they would not carry over."""
-    if not selection.named or not _much_left(selection):
+    if not selection.named or not _leaves_more(selection, ABOVE_NOISE):
         return False
     if _share_left(selection) > LEFT_OF_ERROR:
         return True
     unsure = any(_is_unsure(named) for named in selection.named)
-    return unsure and one_speed(selection.now.evidence) and _much_left(selection, MUCH_LEFT) > 0.0
+    return unsure and one_speed(selection.now.evidence) and _leaves_more(selection, MUCH_LEFT)
 
 
 def _share_left(selection: Selection) -> float:
@@ -288,7 +288,7 @@ def _not_as_judged(after: Sequence[FreeRun], runs: Sequence[FreeRun], selection:
     shown = 1.0 - rms_of(after) / rms_of(runs)
     if not selection.named or shown >= GAIN_SHOWN * (1.0 - _share_left(selection)):
         return False
-    return _much_left(selection) > 0.0
+    return _leaves_more(selection, ABOVE_NOISE)
 
 
 def _selected(base: Explanation, of_family: Evidence | None) -> Selection:

@@ -263,7 +263,7 @@ def require_resolved(axis: ExportedAxis) -> None:
         if law[0] > 0.0 and 2.0 * resolved(law[1]) > MAX_DT:
             raise UsageError(
                 f"axis '{axis.name}': effect 'resonance' has a mode of {law[1] / (2.0 * pi):.3g} Hz, too slow for an "
-                f"export (from {4.0 * SPACING / ((HISTORY - 4) * pi * MAX_DT):.2g} Hz on); leave it out of the model"
+                f"export (from {resolved(1.0) / (pi * MAX_DT):.2g} Hz on); leave it out of the model"
             )
 
 

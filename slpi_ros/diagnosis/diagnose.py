@@ -10,12 +10,14 @@ from threadpoolctl import threadpool_limits
 
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.arrays.rates import fastest
+from slpi_ros.diagnosis.candidates import contenders, is_own, seen
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
-from slpi_ros.diagnosis.selection import BIAS, CONVERGED, Named, Selection, contenders, is_own, seen, select
+from slpi_ros.diagnosis.selection import CONVERGED, Named, Selection, select
 from slpi_ros.diagnosis.significance import counts, worse_on_none
+from slpi_ros.diagnosis.structures import BIAS
 from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.registry import EFFECTS, in_order
 from slpi_ros.errors import SlpiError, UsageError

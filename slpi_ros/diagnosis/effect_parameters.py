@@ -72,6 +72,12 @@ class EachRecord(EffectBase):
         """Return whether the parameters of each record are plausible."""
         return all(part.plausible(view.of_record(k)) for k, part in enumerate(self.parts))
 
+    def only_plausible(self, view: FitContext) -> "EachRecord | None":
+        """Return the effect of each record without those of its parts that are not plausible."""
+        parts = [part.only_plausible(view.of_record(k)) for k, part in enumerate(self.parts)]
+        found = tuple(part for part in parts if part is not None)
+        return EachRecord(found) if len(found) == len(parts) else None
+
     def free_leaves(self) -> list[Leaf]:
         """Return the fitted numbers of all records."""
         return [leaf for part in self.parts for leaf in part.free_leaves()]

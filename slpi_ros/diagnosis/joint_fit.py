@@ -469,7 +469,7 @@ class Explanation:
 
     def respond(self, u: FloatArray) -> FloatArray:
         """Return the displacement of the hysteresis, shape (N,), metres, for another voltage `u`, shape (N,), volts."""
-        response = self.evidence.design(self.evidence.samples(u)).predict(self._x)[self.evidence.rows]
+        response = self.evidence.predict(self.evidence.samples(u), self._x)[self.evidence.rows]
         return response * self.joint.problem.scale
 
     @cached_property
@@ -644,7 +644,7 @@ class Explanation:
             path = np.array([first, low, high, middle, low, middle])
             whole = Samples(path, path, np.ones(path.size, dtype=bool)).after(part.history)
             x = self._x[: self.evidence.basis.size + 1]
-            y = self.evidence.design([whole]).predict(x)[-path.size :] * self.joint.problem.scale
+            y = self.evidence.predict([whole], x)[-path.size :] * self.joint.problem.scale
             zeros.append(0.5 * (y[3] + y[5]) + float(self.h[rows.start]) - y[0])
         return np.array(zeros)
 

@@ -13,7 +13,7 @@ from slpi_ros.errors import RecordError
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.bases import Basis, SurfaceBasis
-from slpi_ros.identification.design_matrix import Design, Walk
+from slpi_ros.identification.design_matrix import Walk
 from slpi_ros.identification.drive import Runs
 from slpi_ros.identification.free_run import choose_start
 from slpi_ros.identification.least_squares import Problem, solve_free
@@ -188,11 +188,15 @@ class Evidence:
         """Pose the problem of fitting the hysteresis, driven by the voltage `u`, shape (N,), volts."""
         return Problem.pose(self.samples(u), self.basis)
 
-    def design(self, samples: Sequence[Samples]) -> Design:
-        """Return the design matrix of the hysteresis for samples."""
+    def predict(self, samples: Sequence[Samples], x: FloatArray) -> FloatArray:
+        """Return the displacement of the hysteresis at samples, shape (N,), for parameters `x`, in their unit."""
         walks = [Walk.along(own.v, symmetric_rest=self.basis.symmetric_rest, primed=own.primed) for own in samples]
-        walk = Walk.joined(walks)
-        return Design.of(walk, self.basis.branch_part(walk))
+        walk, size = Walk.joined(walks), self.basis.size
+        increments = self.basis.increments(walk, x[:size])
+        # The displacement at rest of each record.
+        rest = walk.origin < 0
+        increments[rest] += x[size:][walk.record[rest]]
+        return walk.accumulated(increments)
 
     def poses_as(self, other: "Evidence") -> bool:
         """Return whether the hysteresis has the same equations for the same voltage."""

@@ -7,12 +7,14 @@ from typing import Any
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
+from slpi_ros.diagnosis.candidates import held_out_error
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.fingerprint import Left, Signals, fingerprint, half_power, hint
 from slpi_ros.diagnosis.joint_fit import Explanation, Score
 from slpi_ros.diagnosis.prepare import MOST_SAMPLES, Evidence, one_speed
-from slpi_ros.diagnosis.selection import BIAS, LEVEL, NOT_CLOSING, Named, Selection, held_out_error
+from slpi_ros.diagnosis.selection import Named, Selection
 from slpi_ros.diagnosis.significance import chance_of_gain
+from slpi_ros.diagnosis.structures import BIAS, LEVEL, NOT_CLOSING
 from slpi_ros.effects.base import Effect, usual_step
 from slpi_ros.effects.excitation import FASTEST
 from slpi_ros.effects.registry import to_document as effect_document

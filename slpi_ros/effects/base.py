@@ -276,6 +276,10 @@ class EffectBase(Protocol):
         others = any(other.time_shift != "none" and other.name != self.name for other in context.effects)
         return self.time_shift != "only" or not others or abs(self.slow_shift) > HELD * context.step
 
+    def only_plausible(self, context: "FitContext") -> Self | None:
+        """Return the effect without those of its parts, such as jumps, that are not plausible; None without parts."""
+        return None
+
     @property
     def courses(self) -> tuple[tuple[float, ...], ...]:
         """Values at the knots of an effect with a free course, record by record; else none."""

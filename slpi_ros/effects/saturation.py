@@ -67,8 +67,10 @@ class Saturation(EffectBase):
     @classmethod
     def fit(cls, context: ResidualContext) -> Iterator["Saturation"]:
         """Yield limits beyond which the displacement remains constant while the voltage changes."""
-        low, width = float(context.u.min()), float(np.ptp(context.u)) / BINS
-        middle, dv, dy = outward_steps(context.u, context.y, context.used)
+        # At the piezo: what the hysteresis feels moves on while the voltage rests.
+        v = context.u if context.around.voltage is None else context.around.voltage
+        low, width = float(v.min()), float(np.ptp(v)) / BINS
+        middle, dv, dy = outward_steps(v, context.y, context.used)
         place = np.clip(((middle - low) / width).astype(np.int64), 0, BINS - 1)
         moved = np.bincount(place, dv**2, BINS)
         gain = np.bincount(place, dv * dy, BINS) / np.maximum(moved, 1e-300)

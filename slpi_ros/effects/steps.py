@@ -64,10 +64,18 @@ class Steps(EffectBase):
 
     def plausible(self, context: FitContext) -> bool:
         """Return whether all jumps are sudden, and not where the voltage turns or jumps by more than chance."""
-        places = np.searchsorted(context.t, self.times)
+        return all(self._sudden(context)) and not follows_drive(np.searchsorted(context.t, self.times), context.v)
+
+    def only_plausible(self, context: FitContext) -> "Steps":
+        """Return the jumps that are sudden: one that was none at first may have been found with others."""
+        kept = zip(self.times, self.sizes, self._sudden(context), strict=True)
+        pairs = [(t, size) for t, size, one in kept if one]
+        return Steps(tuple(t for t, _ in pairs), tuple(size for _, size in pairs))
+
+    def _sudden(self, context: FitContext) -> list[bool]:
+        places = np.searchsorted(context.t, self.times).tolist()
         left = np.interp(context.t, context.t[context.used], context.left_without(self.name)[context.used])
-        pairs = zip(places.tolist(), self.sizes, strict=True)
-        return all(sudden(left, k, size) for k, size in pairs) and not follows_drive(places, context.v)
+        return [sudden(left, k, size) for k, size in zip(places, self.sizes, strict=True)]
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement with the jumps, shape (N,), metres."""

@@ -44,6 +44,9 @@ class Basis(Protocol):
     def branch_part(self, walk: Walk) -> sp.csr_array:
         """Return the displacement increment along each sample's branch per unit of each parameter, shape (N, size)."""
 
+    def increments(self, walk: Walk, x: FloatArray) -> FloatArray:
+        """Return the product of `branch_part` and parameters `x`, shape (size,), without the matrix, shape (N,)."""
+
     @property
     def roughness(self) -> sp.csr_array:
         """The matrix R, shape (r, size + 1), of the roughness penalty ``|R x|^2`` on the coefficients x."""
@@ -98,6 +101,38 @@ class SurfaceBasis:
             rise = rises.astype(np.float64)
             part = part + self._rise_rows(v, rise) - self._rise_rows(v_origin, rise)
         return sp.csr_array(part)
+
+    def increments(self, walk: Walk, x: FloatArray) -> FloatArray:
+        """Return the increment along the branch of each sample for parameters `x`, shape (size,), in their unit."""
+        surface, rise = self._surface(x), x[self._rise_columns]
+        rises, falls_long = walk.first_rise, walk.long_fall
+        upper, lower = np.maximum(walk.v, walk.v_origin), np.minimum(walk.v, walk.v_origin)
+        along = self._everett(surface, upper, lower) * np.where(rises | falls_long, 0, walk.direction)
+        if falls_long.any():
+            v, top = walk.v[falls_long], np.full(np.count_nonzero(falls_long), self.grid[-1])
+            fallen = self._everett(surface, top, walk.v_rest[falls_long]) - self._everett(surface, top, v)
+            along[falls_long] = fallen
+        if rises.any():
+            v, v_origin = walk.v[rises], walk.v_origin[rises]
+            along[rises] = np.interp(v, self.grid, rise) - np.interp(v_origin, self.grid, rise)
+        return along
+
+    def _surface(self, x: FloatArray) -> FloatArray:
+        """Return the Everett function at the vertices, shape (n, n), of parameters `x`; 0 on and above the diagonal."""
+        n = self.grid.size
+        surface = np.zeros((n, n))
+        surface[np.tril_indices(n, -1)] = x[: n * (n - 1) // 2]
+        return surface
+
+    def _everett(self, surface: FloatArray, upper: FloatArray, lower: FloatArray) -> FloatArray:
+        """Return the Everett function interpolated as in `_surface_rows`, shape (N,)."""
+        (i, p), (j, q) = self._cell(upper), self._cell(lower)
+        flat, at = surface.ravel(), i * self.grid.size + j
+        below, above = flat[at], flat[at + self.grid.size]
+        left, right = below + p * (above - below), flat[at + 1]
+        right = right + p * (flat[at + self.grid.size + 1] - right)
+        between: FloatArray = np.where(i == j, (p - q) * above, left + q * (right - left))
+        return between
 
     def _cell(self, v: FloatArray) -> tuple[IntArray, FloatArray]:
         x = (v - self.grid[0]) / (self.grid[1] - self.grid[0])
@@ -186,8 +221,7 @@ class SurfaceBasis:
     def shape(self, x: FloatArray, gain: float) -> LoopFamily:
         """Return the loop family with parameters `x` (m); `gain` is not used."""
         n = self.grid.size
-        surface = np.zeros((n, n))
-        surface[np.tril_indices(n, -1)] = x[: n * (n - 1) // 2]
+        surface = self._surface(x)
         last = max(1, round(END_SHARE * n))
         risen, fallen = surface[-1, 0] - surface[-1 - last, 0], surface[-1, 0] - surface[-1, last]
         edge_gain = float(risen + fallen) / (2 * last * float(self.grid[1] - self.grid[0]))
@@ -214,6 +248,15 @@ class OperatorWeights:
     def roughness(self) -> sp.csr_array:
         """Return a zero row: the non-negative weights need no roughness penalty."""
         return sp.csr_array((1, self.size + 1))
+
+    def increments(self, walk: Walk, x: FloatArray) -> FloatArray:
+        """Return the increment along the branch of each sample for parameters `x`, shape (size,), in their unit."""
+        along: FloatArray = self.branch_part(walk) @ x
+        return along
+
+    def branch_part(self, walk: Walk) -> sp.csr_array:
+        """Return the motion of each operator along the branch of each sample, shape (N, size)."""
+        raise NotImplementedError
 
     def monotone(self, gain: float) -> tuple[sp.csr_array, FloatArray]:
         """Return the constraints of non-negative weights and a positive weight at the lowest threshold."""

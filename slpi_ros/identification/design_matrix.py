@@ -45,6 +45,33 @@ class Walk:
         v, direction = (np.concatenate([getattr(walk, name) for walk in walks]) for name in ("v", "direction"))
         return cls(v, np.concatenate(origin), direction, np.concatenate(first))
 
+    @cached_property
+    def turns(self) -> IntArray:
+        """Reversals, samples at which branches start, ascending."""
+        return np.flatnonzero(np.bincount(self.origin[self.origin >= 0], minlength=1))
+
+    @cached_property
+    def branch(self) -> IntArray:
+        """Index into `turns` of the reversal at which each sample's branch started, shape (N,); -1 for none."""
+        place = np.empty(self.v.size, dtype=np.int64)
+        place[self.turns] = np.arange(self.turns.size)
+        return np.where(self.origin >= 0, place[np.maximum(self.origin, 0)], -1)
+
+    @cached_property
+    def _before(self) -> list[tuple[int, int]]:
+        """Pairs of a reversal and the reversal at which its branch started, as indices into `turns`, ascending."""
+        before = self.branch[self.turns]
+        rows = np.flatnonzero(before >= 0)
+        return list(zip(rows.tolist(), before[rows].tolist(), strict=True))
+
+    def accumulated(self, increments: FloatArray) -> FloatArray:
+        """Return the displacement of every sample, shape (N,), from its increment along its branch, shape (N,)."""
+        at_turns = increments[self.turns].tolist()
+        for row, before in self._before:
+            at_turns[row] += at_turns[before]
+        whole: FloatArray = increments + np.array([*at_turns, 0.0])[self.branch]
+        return whole
+
     @property
     def v_rest(self) -> FloatArray:
         """Voltage at which each sample's record started, shape (N,), volts."""
@@ -54,6 +81,11 @@ class Walk:
     def v_origin(self) -> FloatArray:
         """Voltage at which each sample's branch started, shape (N,), volts; `v_rest` for branches without reversal."""
         return np.where(self.origin >= 0, self.v[np.maximum(self.origin, 0)], self.v_rest)
+
+    @property
+    def record(self) -> IntArray:
+        """Number of the record of each sample, shape (N,)."""
+        return np.cumsum(self.first == np.arange(self.first.size)) - 1
 
     @property
     def first_rise(self) -> Mask:
@@ -76,28 +108,20 @@ class Design:
     """Design matrix of the linear prediction: one column per parameter, then each record's displacement at rest."""
 
     local: sp.csr_array  # (N, p): increments along the branch of each sample
-    turns: IntArray  # reversals, samples at which branches start, ascending
     walk: Walk
 
-    @cached_property
-    def _branch(self) -> IntArray:
-        """Index into `turns` of the reversal at which each sample's branch started, shape (N,); -1 for none."""
-        origin = self.walk.origin
-        return np.where(origin >= 0, np.searchsorted(self.turns, origin), -1)
-
-    @cached_property
-    def _before(self) -> list[tuple[int, int]]:
-        """Pairs of a reversal and the reversal at which its branch started, as indices into `turns`, ascending."""
-        before = self._branch[self.turns]
-        rows = np.flatnonzero(before >= 0)
-        return list(zip(rows.tolist(), before[rows].tolist(), strict=True))
+    @property
+    def turns(self) -> IntArray:
+        """Reversals, samples at which branches start, ascending."""
+        return self.walk.turns
 
     @cached_property
     def pick(self) -> sp.csr_array:
         """Sparse matrix that selects the reversal at which each sample's branch started, shape (N, reversals)."""
-        on_branch = self._branch >= 0
+        branch = self.walk.branch
+        on_branch = branch >= 0
         pointers = np.concatenate([[0], np.cumsum(on_branch)])
-        columns = self._branch[on_branch]
+        columns = branch[on_branch]
         return sp.csr_array((np.ones(columns.size), columns, pointers), shape=(self.walk.v.size, self.turns.size))
 
     @cached_property
@@ -113,20 +137,14 @@ class Design:
     @classmethod
     def of(cls, walk: Walk, branch_part: sp.csr_array) -> "Design":
         """Return the design matrix of a `branch_part`, shape (N, size), with a column for each displacement at rest."""
-        rows = np.flatnonzero(walk.origin < 0)
-        record = np.cumsum(walk.first == np.arange(walk.first.size)) - 1
+        rows, record = np.flatnonzero(walk.origin < 0), walk.record
         no_turn = sp.csr_array((np.ones(rows.size), (rows, record[rows])), shape=(walk.v.size, int(record[-1]) + 1))
         local = sp.csr_array(sp.hstack([branch_part, no_turn], format="csr"))
-        return cls(local, np.unique(walk.origin[walk.origin >= 0]), walk)
+        return cls(local, walk)
 
     def predict(self, x: FloatArray) -> FloatArray:
         """Return the displacement of every sample, shape (N,), for parameters `x`, shape (p,), in the unit of `x`."""
-        result: FloatArray = self.local @ x
-        at_turns = result[self.turns].tolist()
-        for row, before in self._before:
-            at_turns[row] += at_turns[before]
-        result += np.array([*at_turns, 0.0])[self._branch]
-        return result
+        return self.walk.accumulated(self.local @ x)
 
     def rows(self, chosen: NDArray[np.integer[Any]]) -> "Rows":
         """Return the rows of some samples."""

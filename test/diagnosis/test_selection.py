@@ -6,8 +6,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from slpi_ros.diagnosis.candidates import alike
 from slpi_ros.diagnosis.joint_fit import Score
-from slpi_ros.diagnosis.selection import alike
 from slpi_ros.diagnosis.significance import (
     CHANCE,
     LEAST_GAIN,

@@ -9,10 +9,10 @@ import pytest
 from effects.supply_sag import SupplySag
 
 import slpi_ros
+from slpi_ros.diagnosis.candidates import contenders
 from slpi_ros.diagnosis.effect_parameters import bounded, free, moved, names, steps
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import evidence_of
-from slpi_ros.diagnosis.selection import contenders
 from slpi_ros.effects import registry
 from slpi_ros.errors import ModelError
 from slpi_ros.excitation.drives import calibration_drive, excite

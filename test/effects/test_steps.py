@@ -61,6 +61,10 @@ def test_jumps_are_plausible_if_sudden_and_where_the_voltage_does_not_turn():
     assert JUMPS.plausible(view(noisy(JUMPS.path(T)), 100 * NOISE * np.sin(2 * np.pi * 90.0 * T)))
     ramp = np.interp(T, (9.0, 10.0), (0.0, 10 * NOISE))
     assert not Steps((9.5,), (10 * NOISE,)).plausible(view(noisy(ramp)))
+    # One that is none goes, the others stay.
+    mixed = Steps((*JUMPS.times, 19.5), (*JUMPS.sizes, 10 * NOISE))
+    left = view(noisy(JUMPS.path(T)))
+    assert not mixed.plausible(left) and mixed.only_plausible(left) == JUMPS
     turns = Steps(tuple(k / 1.4 + 5e-4 for k in range(1, 6)), tuple(10 * NOISE * (-1) ** k for k in range(5)))
     assert not turns.plausible(view(noisy(turns.path(T))))
     assert not follows_drive(np.array([5000, 9000]), V)

@@ -42,6 +42,9 @@ def test_prediction_is_what_the_engine_simulates(kind, primed, seed, corners, be
     v = np.interp(np.linspace(0, corners - 1, corners * between), np.arange(corners), rng.uniform(-3, 9, corners))
     walk = Walk.along(v, symmetric_rest=basis.symmetric_rest, primed=primed)
     predicted = Design.of(walk, basis.branch_part(walk)).predict(x)
+    increments = basis.increments(walk, x[:-1])
+    np.testing.assert_allclose(increments, basis.branch_part(walk) @ x[:-1], atol=1e-9)
+    np.testing.assert_allclose(walk.accumulated(increments + x[-1] * (walk.origin < 0)), predicted, atol=1e-9)
     memory = Memory(basis.shape(x, 1.0), float(v[0]), float(x[-1]), primed=primed)
     np.testing.assert_allclose(predicted, memory.forward_array(v), atol=1e-8)
 

@@ -113,7 +113,9 @@ def write_files(folder: Path, document: dict[str, Any]) -> None:
     page.heading("Method")
     page.lines(document["method"])
     page.heading("Records and conditions")
-    page.table(*_records_table(document))
+    for number, record in enumerate(document["records"], 1):
+        page.subsection(f"Record {number}")
+        page.definitions(_record_facts(record))
     for name, axis in document["axes"].items():
         _show_axis(page, name, axis)
     page.heading("Versions")
@@ -148,21 +150,18 @@ def _show_axis(page: Page, name: str, axis: dict[str, Any]) -> None:
         }
     )
     page.section("Errors")
-    header = (
-        "record", "", "judged", "rms (nm)", "maximum (nm)", "offset (µm)", "rms without (nm)", "maximum without (nm)",
-        "limit (nm)", "initial state", "within 2 u",
-    )  # fmt: skip
+    header = "record", "", "judged", "rms", "max", "offset", "rms without", "max without", "limit", "within 2 u"
     rows = [
         (
-            one["source"], one["verdict"], f"{one['samples']:,} ({one['share']:.0%})", f"{one['rms_m'] * 1e9:.1f}",
-            f"{one['maximum_m'] * 1e9:.1f}", f"{one['constant_m'] * 1e6:+.3f}", f"{one['rest_rms_m'] * 1e9:.1f}",
-            f"{one['rest_maximum_m'] * 1e9:.1f}", f"{one['limit_m'] * 1e9:.1f}", one["start"],
+            str(number), one["verdict"], f"{one['samples']:,} ({one['share']:.0%})", _nm(one["rms_m"]),
+            _nm(one["maximum_m"]), f"{one['constant_m'] * 1e9:+.1f}", _nm(one["rest_rms_m"]),
+            _nm(one["rest_maximum_m"]), _nm(one["limit_m"]),
             "not known" if one["within_expanded"] is None else f"{one['within_expanded']:.1%}",
         )
-        for one in axis["errors"]
+        for number, one in enumerate(axis["errors"], 1)
     ]  # fmt: skip
-    page.table(header, rows)
-    page.lines([f"{one['source']}: {remark}" for one in axis["errors"] for remark in one["remarks"]])
+    page.table(header, rows, caption="Errors in nm, with the offset and without it; u: combined standard uncertainty.")
+    page.lines([f"record {k}: {remark}" for k, one in enumerate(axis["errors"], 1) for remark in one["remarks"]])
     page.section("Budget of uncertainty")
     if axis["uncertainty"] is None:
         page.text(f"Not known: {axis['uncertainty_unknown']}.")
@@ -181,12 +180,13 @@ def _show_budget(page: Page, uncertainty: dict[str, Any]) -> None:
             ("expanded", f"combined, with the coverage factor {COVERAGE_FACTOR:g}"),
         )
     ]
+    unknown = " The values of the recorded quantities count as not known." if middle[0]["surroundings_m"] else ""
     page.table(
         ("component", "what it is", *TIMES),
         rows,
         caption="Standard uncertainty (nm) of the displacement that the model promises, at the middle of the range, by "
         "the time since the last reset or calibration. Without a reset, besides "
-        f"{length(uncertainty['unknown_memory_m'])} at first, until the voltage has gone over its range.",
+        f"{length(uncertainty['unknown_memory_m'])} at first, until the voltage has gone over its range.{unknown}",
     )
     places = [budget[k :: len(PLACES)] for k in range(len(PLACES))]
     page.table(
@@ -199,21 +199,20 @@ def _show_budget(page: Page, uncertainty: dict[str, Any]) -> None:
     )  # fmt: skip
 
 
-def _records_table(document: dict[str, Any]) -> tuple[Sequence[str], list[Sequence[str] | str]]:
-    rows: list[Sequence[str] | str] = []
-    for one in document["records"]:
-        conditions = [f"{each['name']} {each['lowest']:.4g} to {each['highest']:.4g}" for each in one["surroundings"]]
-        rows.append(
-            (
-                one["source"],
-                one["begins"],
-                f"{one['duration_s']:.1f}",
-                "yes" if one["independent"] else "no: the model was identified from it",
-                ", ".join(conditions) or "not recorded",
-                "; ".join(f"{name} {digest}" for name, digest in one["files"].items()),
-            )
-        )
-    return ("record", "begins", "duration (s)", "independent", "surroundings", "SHA-256"), rows
+def _nm(metres: float) -> str:
+    return f"{metres * 1e9:.1f}"
+
+
+def _record_facts(one: dict[str, Any]) -> dict[str, str]:
+    conditions = [f"{each['name']} {each['lowest']:.4g} to {each['highest']:.4g}" for each in one["surroundings"]]
+    return {
+        "bag": one["source"],
+        "begins": one["begins"],
+        "duration": f"{one['duration_s']:.1f} s",
+        "independent": "yes" if one["independent"] else "no: the model was identified from it",
+        "surroundings": ", ".join(conditions) or "not recorded",
+        **{f"SHA-256 of {name}": digest for name, digest in one["files"].items()},
+    }
 
 
 def _record(record: Record, bag: str, model: StageModel, *, independent: bool) -> dict[str, Any]:

@@ -9,6 +9,7 @@ from dataclasses import dataclass, fields, replace
 from functools import cached_property
 from math import exp, hypot, inf, log1p, sqrt
 from numbers import Real
+from typing import TypeVar
 
 import numpy as np
 
@@ -26,6 +27,7 @@ RECTANGULAR = 1.0 / sqrt(12.0)
 # An error with a cause that is not in the model is no chance: on another path it may stay at its bound. That of a
 # rectangular distribution is this multiple of its rms.
 SYSTEMATIC = sqrt(3.0)
+Scalars = TypeVar("Scalars", float, FloatArray)
 # Points of the table over the range, and steps of that of the memory to either end.
 POINTS, STEPS = 200, 32
 # Components of the budget, with what each of them is.
@@ -289,7 +291,7 @@ class StreamingUncertainty:
         self._drift = of.drift_square
         self._more = bool(of.gain_drift_square or of.creep or of.quantities)
         self._fastest = of.fastest if of.fastest > 0.0 else inf
-        self._values: dict[str, FloatArray] = {}
+        self._values: dict[str, float] = {}
         self._known = of.known_memory
         self._memory = 0.0
         self._extremes = of.initial_voltage, of.initial_voltage
@@ -306,7 +308,7 @@ class StreamingUncertainty:
 
     def surround(self, values: Mapping[str, float]) -> None:
         """Note values of quantities that the stage follows, by name, in their units."""
-        self._values.update({key: np.array([value]) for key, value in values.items()})
+        self._values.update(values)
 
     def note(self, t: float, y: float, v: float) -> None:
         """Follow a sample: time (s), displacement (m) and its voltage (V)."""
@@ -347,17 +349,16 @@ class StreamingUncertainty:
         square = of.gain_drift_square * (since + of.duration) * (y - of.gain_origin) ** 2
         square += (of.creep * log1p(since / of.duration)) ** 2
         square += sum(size * exp(-since / tau) for tau, size in of.relaxations) ** 2
-        moved = np.array([y - of.quantity_origin])
-        return square + sum(
-            float(_quantity_square(one, self._values.get(one.followed.key), moved)[0]) for one in of.quantities
-        )
+        moved = y - of.quantity_origin
+        for one in of.quantities:
+            square += _quantity_square(one, self._values.get(one.followed.key), moved)
+        return square
 
 
-def _quantity_square(one: FollowedGain, value: FloatArray | None, moved: FloatArray) -> FloatArray:
+def _quantity_square(one: FollowedGain, value: Scalars | None, moved: Scalars) -> Scalars:
     """Return the square of the uncertainty (m^2) for values or None, `moved` (m) away from the origin."""
-    (zero, sensitivity), (own, of_sensitivity) = one.gains, one.uncertainty
+    (_, reference, lowest, highest), (zero, sensitivity), (own, of_sensitivity) = one
     if value is None:
         # It is anywhere in its recorded range.
-        spread = RECTANGULAR * (one.followed.highest - one.followed.lowest)
-        return np.asarray(((zero + sensitivity * moved) * spread) ** 2)
-    return np.asarray((own**2 + (of_sensitivity * moved) ** 2) * (value - one.followed.reference) ** 2)
+        return ((zero + sensitivity * moved) * (RECTANGULAR * (highest - lowest))) ** 2
+    return (own * own + (of_sensitivity * moved) ** 2) * (value - reference) ** 2

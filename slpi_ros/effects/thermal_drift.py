@@ -1,6 +1,6 @@
 """Thermal drift: slow change of the displacement, independent of the voltage."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import ClassVar
@@ -18,7 +18,7 @@ from slpi_ros.effects.base import (
     Signal,
 )
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
-from slpi_ros.effects.parameters import Fit, parameter, require
+from slpi_ros.effects.parameters import Fit, Leaf, parameter, require
 
 # Numbers of knots of the candidates.
 KNOTS = (2, 3, 5, 8, 13)
@@ -74,6 +74,14 @@ class ThermalDrift(EffectBase):
     def courses(self) -> tuple[tuple[float, ...], ...]:
         """Displacements at the knots, m."""
         return (self.values,)
+
+    def free_leaves(self) -> list[Leaf]:
+        """Return the displacements at the knots but the last one: a constant belongs to the zero."""
+        return super().free_leaves()[:-1]
+
+    def with_free(self, numbers: Iterable[float]) -> "ThermalDrift":
+        """Return the drift with other displacements at the knots but the last one."""
+        return super().with_free([*numbers, self.values[-1]])
 
     def plausible(self, context: FitContext) -> bool:
         """Return whether it is slow."""

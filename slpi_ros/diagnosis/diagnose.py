@@ -19,6 +19,7 @@ from slpi_ros.diagnosis.selection import CONVERGED, Named, Selection, select
 from slpi_ros.diagnosis.significance import counts, worse_on_none
 from slpi_ros.diagnosis.structures import BIAS
 from slpi_ros.effects.base import EffectContext
+from slpi_ros.effects.chain import Chain
 from slpi_ros.effects.registry import EFFECTS, in_order
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
@@ -466,7 +467,7 @@ def _extended(model: AxisModel, now: Explanation, source: str) -> AxisModel:
         model,
         kind="pi" if isinstance(evidence.basis, PlayBasis) else "slpi",
         hysteresis=hysteresis,
-        start=Start(float(first.v[0]), starts[0], first.history),
+        start=Start(float(np.clip(first.v[0], *Chain.of(now.effects).clipped)), starts[0], first.history),
         voltage_range=(float(voltage.min()), float(voltage.max())),
         displacement_range=(float(y.min()), float(y.max())),
         effects=tuple(

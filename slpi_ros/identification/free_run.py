@@ -169,6 +169,8 @@ def likely_starts(axis: AxisModel, v: float, *others: tuple[float, ...]) -> list
     if not axis.causal:
         return [axis.start]
     low, high = axis.hysteresis_range
+    # A saturation keeps the hysteresis within its limits.
+    v = min(max(v, axis.chain.clipped[0]), axis.chain.clipped[1])
     ends = np.array([min(low, v), max(high, v)])
     usual = histories(Samples(np.append(v, ends), np.zeros(3), np.ones(3, dtype=bool)))
     swept = axis.memory("start").forward_array(ends)[-1]

@@ -18,6 +18,8 @@ import yaml
 ROOT = Path(__file__).resolve().parents[1]
 SHARE = {"slpi_ros": ROOT}
 Arguments = dict[str, str]
+# What an executable says when it is ready.
+READY = {"device_simulator": "own range"}
 
 
 class Stand:
@@ -223,17 +225,13 @@ def _on_output(handler: OnProcessIO, arguments: Arguments) -> list[Started]:
     source = _started(handler.named["target_action"], arguments)
     if not source:
         return []
-    for text, expected in ((b"anything else\n", 0), (READY[source[0].executable], 1)):
+    for text, expected in ((b"anything else\n", 0), (f"it says: {READY[source[0].executable]}\n".encode(), 1)):
         event = Stand()
         event.text = text  # type: ignore[attr-defined]
         answers = [each for each in (handler.named[key](event) for key in ("on_stdout", "on_stderr")) if each]
         # Launch starts one action once.
         assert len(set(map(id, answers))) == expected
     return _started(answers[0], arguments, source[0].executable)
-
-
-# What an executable logs when it is ready; the tests of the nodes compare it with what they say.
-READY = {"device_simulator": b"axes 1, own range -20 to 120 V, amplifier 1 V/V\n"}
 
 
 def _value(given: Any, arguments: Arguments) -> Any:

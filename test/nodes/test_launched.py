@@ -47,8 +47,7 @@ def by_reading(path, arguments):
         running = {}
         for node in sorted(nodes_of(path, arguments), key=lambda each: each.after):
             if node.after:
-                ready = READY[node.after].split(b",")[1].split()[:2]
-                while b" ".join(ready).decode() not in running[node.after].stderr:
+                while READY[node.after] not in running[node.after].stderr:
                     assert running[node.after].process.poll() is None, running[node.after].stderr
             running[node.executable] = life.enter_context(started(node.executable, node.parameters, *node.words()))
         yield lambda: "".join(each.stderr for each in running.values())

@@ -66,7 +66,8 @@ def by_launch(path, arguments):
         )
     try:
         yield log.read_text
-        process.send_signal(signal.SIGINT)
+        # To the group, as a terminal does; launch leaves that to it.
+        os.killpg(process.pid, signal.SIGINT)
         assert process.wait(60.0) == 0
         assert log.read_text().count("process has finished cleanly") == 3
     finally:

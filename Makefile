@@ -61,7 +61,7 @@ help:
 	@echo 'make bench-latency  round trip through the compensator beside a bare echo node, 4 minutes'
 	@echo 'make bench-driver    cycles of the driver with simulated devices: rate, lateness, processor, two minutes'
 	@echo 'make bench-device-faults  faults of simulated devices: what moves, how long a call waits, when it is told, 4 minutes'
-	@echo 'make bench-device-lives   calibration, scan and verification through every driver and without one, 17 minutes'
+	@echo 'make bench-device-lives   calibration, scan and verification through every driver and without one, 24 minutes'
 	@echo 'make bench-surroundings  hidden temperature and load: right topic, gain, decoys, a later day; half an hour'
 	@echo 'make bench-platforms  RECORD=table.csv: the ten commands with the versions of Ubuntu 24.04: the same figures?'
 	@echo 'make bench-restarts   a compensator that is killed and started again: time to its first answer, 10 minutes'

@@ -120,9 +120,12 @@ def driven(name, address, rate, seconds):
         time.sleep(0.01)
     loop.timing.restart()
     before, late, used, begun = loop.counts.cycles, loop.counts.late, time.process_time(), time.perf_counter()
+    sent = 0
     while (t := time.perf_counter() - begun) < seconds:
         loop.command([45.0 + 40.0 * math.sin(6.0 * t)] * len(axes))
-        time.sleep(1.0 / rate)
+        # Steadily, as a compensator does: the cycles fall in step with the commands.
+        sent = max(sent + 1, int(t * rate))
+        time.sleep(max(begun + sent / rate - time.perf_counter(), 0.0))
     cycles, late, used = loop.counts.cycles - before, loop.counts.late - late, time.process_time() - used
     report = loop.timing.report()
     loop.end()

@@ -4,18 +4,23 @@ ros2 launch slpi_ros calibrate.launch.py params_file:=calibrator.yaml output:=my
 ros2 launch slpi_ros calibrate.launch.py params_file:=calibrator.yaml output:=demo simulate:=true
 ros2 launch slpi_ros calibrate.launch.py params_file:=calibrator.yaml output:=my_stage driver_file:=driver.yaml
 
+With device_file a simulated device is started for the driver.
+
 The launch ends with the calibrator, whose exit code is 0 if the target is met, else 1.
 """
 
-from launch.actions import DeclareLaunchArgument, EmitEvent, RegisterEventHandler
+from launch.actions import DeclareLaunchArgument, EmitEvent, IncludeLaunchDescription, RegisterEventHandler
 from launch.conditions import IfCondition, UnlessCondition
 from launch.event_handlers import OnProcessExit
 from launch.events import Shutdown
-from launch.substitutions import EqualsSubstitution, LaunchConfiguration
+from launch.substitutions import EqualsSubstitution, LaunchConfiguration, PathJoinSubstitution
 from launch_ros.actions import Node
 from launch_ros.parameter_descriptions import ParameterValue
+from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
+
+DEVICE = PathJoinSubstitution([FindPackageShare("slpi_ros"), "launch", "device.launch.py"])
 
 # Argument, and topic of the nodes that it remaps, with its meaning.
 TOPICS = {
@@ -44,15 +49,14 @@ def generate_launch_description() -> LaunchDescription:
         condition=IfCondition(LaunchConfiguration("simulate")),
         output="screen",
     )
-    driver = Node(
-        package="slpi_ros",
-        executable="driver",
-        name="driver",
-        namespace=namespace,
-        parameters=[LaunchConfiguration("driver_file")],
-        remappings=topics,
+    driver = IncludeLaunchDescription(
+        DEVICE,
+        launch_arguments=[
+            (argument, LaunchConfiguration(argument))
+            for argument in ("driver_file", "device_file", "namespace", *TOPICS)
+            if argument != "model_topic"
+        ],
         condition=UnlessCondition(EqualsSubstitution(LaunchConfiguration("driver_file"), "")),
-        output="screen",
     )
     calibrator = Node(
         package="slpi_ros",
@@ -87,6 +91,9 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument("simulated_seed", default_value="1", description="seed of the simulated stage"),
         DeclareLaunchArgument(
             "driver_file", default_value="", description="parameters of the node driver; empty: no driver is started"
+        ),
+        DeclareLaunchArgument(
+            "device_file", default_value="", description="parameters of a simulated device for the driver; empty: none"
         ),
         simulator,
         driver,

@@ -1,18 +1,19 @@
 """Start one compensator: ros2 launch slpi_ros compensator.launch.py params_file:=... model_file:=...
 
-With driver_file:=driver.yaml the driver of the amplifier is started, too.
+With driver_file:=driver.yaml the driver of the amplifier is started, too; with device_file a simulated device for it.
 """
 
-from launch.actions import DeclareLaunchArgument
+from launch.actions import DeclareLaunchArgument, IncludeLaunchDescription
 from launch.conditions import IfCondition, UnlessCondition
 from launch.substitutions import EqualsSubstitution, LaunchConfiguration, PathJoinSubstitution
-from launch_ros.actions import LifecycleNode, Node
+from launch_ros.actions import LifecycleNode
 from launch_ros.parameter_descriptions import ParameterValue
 from launch_ros.substitutions import FindPackageShare
 
 from launch import LaunchDescription
 
 ONE_AXIS = PathJoinSubstitution([FindPackageShare("slpi_ros"), "config", "one_axis.yaml"])
+DEVICE = PathJoinSubstitution([FindPackageShare("slpi_ros"), "launch", "device.launch.py"])
 
 # Argument, and topic of the nodes that it remaps, with its meaning.
 TOPICS = {
@@ -29,7 +30,7 @@ TOPICS = {
     "trajectory_state_topic": ("voltage_trajectory_state", "topic of what becomes of them"),
     "recorded_topic": ("recorded_trajectory", "topic of what the device recorded of them"),
 }
-# Those of the driver.
+# Those of the driver, as in device.launch.py.
 DRIVER_TOPICS = (
     "voltage_topic", "state_topic", "diagnostics_topic", "voltage_trajectory_topic", "trajectory_state_topic",
     "recorded_topic",
@@ -47,6 +48,9 @@ def generate_launch_description() -> LaunchDescription:
         DeclareLaunchArgument(
             "driver_file", default_value="", description="parameters of the node driver; empty: no driver is started"
         ),
+        DeclareLaunchArgument(
+            "device_file", default_value="", description="parameters of a simulated device for the driver; empty: none"
+        ),
         DeclareLaunchArgument("namespace", default_value="", description="namespace of the nodes and their topics"),
         *(
             DeclareLaunchArgument(argument, default_value=topic, description=meaning)
@@ -54,14 +58,12 @@ def generate_launch_description() -> LaunchDescription:
         ),
         compensator(as_in_params_file, IfCondition(no_model_file)),
         compensator(with_model_file, UnlessCondition(no_model_file)),
-        Node(
-            package="slpi_ros",
-            executable="driver",
-            name="driver",
-            namespace=LaunchConfiguration("namespace"),
-            parameters=[LaunchConfiguration("driver_file")],
-            remappings=[(TOPICS[argument][0], LaunchConfiguration(argument)) for argument in DRIVER_TOPICS],
-            output="screen",
+        IncludeLaunchDescription(
+            DEVICE,
+            launch_arguments=[
+                (argument, LaunchConfiguration(argument))
+                for argument in ("driver_file", "device_file", "namespace", *DRIVER_TOPICS)
+            ],
             condition=UnlessCondition(EqualsSubstitution(LaunchConfiguration("driver_file"), "")),
         ),
     ])  # fmt: skip

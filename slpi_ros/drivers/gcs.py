@@ -18,6 +18,7 @@ from slpi_ros.drivers.base import (
     Channel,
     Device,
     Found,
+    LinkError,
     Reading,
     Recording,
     RefusedError,
@@ -60,7 +61,12 @@ class GcsDevice(Device):
     def open(self) -> Found:
         """Connect, then only ask."""
         self._stream.open()
-        identity = " ".join(self._ask("*IDN?"))
+        try:
+            identity = " ".join(self._ask("*IDN?"))
+        except LinkError as error:
+            raise LinkError(
+                f"{error}; check that it is a controller that speaks GCS, and that no other program is connected to it"
+            ) from error
         self._known = frozenset(line.split()[0].upper() for line in self._ask("HLP?") if line.split())
         if lacking := [command for command in NEEDED if command not in self._known]:
             raise UnsuitableError(

@@ -230,7 +230,9 @@ class LabjackDevice(Device):
             answer = getattr(client, function)(*given, device_id=UNIT, **named)
         except ModbusException as error:
             raise LinkError(f"{self.name}: no whole answer to {what} within {TIMEOUT:g} s ({error.string})") from error
-        except (OSError, ValueError, struct.error, IndexError) as error:
+        except OSError as error:
+            raise LinkError(f"{self.name}: the link was lost at {what} ({error.strerror or error})") from error
+        except (ValueError, struct.error, IndexError) as error:
             raise AnswerError(f"{self.name}: {what} was answered by what is no Modbus ({error})") from error
         if len(self._answer) != HEADER + int.from_bytes(self._answer[HEADER - 2 : HEADER], "big"):
             raise AnswerError(f"{self.name}: {len(self._answer)} bytes came for {what}, more than one answer to it")

@@ -42,6 +42,8 @@ SYNTAX = re.compile(r"(ao\d+):(ai\d+)(?::(ai\d+))?")
 INPUT_RANGE, BEYOND = 10.0, 1.1
 # Errors after which the device is not there any more, or did not answer in time.
 GONE = {-88705, -88710, -50405, -200220, -201003, -200284, -200474}
+# A task does not exist any more: somebody has cleared it. On one server that is another driver at the same device.
+CLEARED = -200088
 # What a block is played and recorded at: the fastest that is asked for, and the most samples.
 FASTEST, LONGEST = 1e-5, 1_000_000
 # Samples that are read at once.
@@ -71,6 +73,7 @@ class NidaqmxDevice(Device):
         self._inputs = [*(f"{self._device}/{sensor}" for _, sensor, _ in wires), *told]
         self._tasks: dict[str, Any] = {}
         self._link: Any = None  # to the gRPC server
+        self._displaced = False  # whether another program has cleared the tasks
         self._range = (-INPUT_RANGE, INPUT_RANGE)
         self._reader: Any = None
         self._writer: Any = None
@@ -86,7 +89,9 @@ class NidaqmxDevice(Device):
         with self._told("opening"):
             if self._place:
                 self._link = _link_to(self.name, *self._place)
-                self._clear_tasks_of_the_past()
+                if not self._displaced:
+                    # Else two drivers would clear each other's tasks, and move the stage by turns.
+                    self._clear_tasks_of_the_past()
             device = NiDevice(self._device, grpc_options=self._options(""))
             identity = f"{device.product_type}, serial number {device.serial_num}"
             ranges = list(device.ao_voltage_rngs)
@@ -95,6 +100,7 @@ class NidaqmxDevice(Device):
             self._range = min(ranges[::2]), max(ranges[1::2])
             self._read_on_demand()
         reading = self.read()
+        self._displaced = False
         ends = [sorted(map(each.stage_volts, self._range)) for each in self.channels]
         return Found(
             identity,
@@ -133,6 +139,9 @@ class NidaqmxDevice(Device):
 
     def close(self) -> None:
         """Clear the tasks; the outputs stay."""
+        if self._displaced:
+            # By their names they may be those of the other program.
+            self._tasks.clear()
         for name in list(self._tasks):
             self._clear(name)
         self._reader = self._writer = self._block = None
@@ -327,11 +336,19 @@ class NidaqmxDevice(Device):
                 f"{self.name}: NI's driver is not installed; install NI-DAQmx, or give {self._device}@HOST of a "
                 "computer with NI's gRPC server"
             ) from error
-        except nidaqmx.errors.DaqError as error:
-            kind = LinkError if error.error_code in GONE else RefusedError
-            raise kind(f"{self.name}: error {error.error_code} at {what}: {_first_line(error)}") from error
         except nidaqmx.errors.Error as error:
-            raise LinkError(f"{self.name}: no answer to {what}: {_first_line(error)}") from error
+            code = getattr(error, "error_code", 0)
+            self._displaced |= code == CLEARED
+            if self._displaced:
+                raise LinkError(
+                    f"{self.name}: its tasks are gone ({_first_line(error)}): another program has taken the device "
+                    "over, or its server was started again; end the other one, or start this driver again to take it "
+                    "back"
+                ) from error
+            if not isinstance(error, nidaqmx.errors.DaqError):
+                raise LinkError(f"{self.name}: no answer to {what}: {_first_line(error)}") from error
+            kind = LinkError if code in GONE else RefusedError
+            raise kind(f"{self.name}: error {code} at {what}: {_first_line(error)}") from error
         except (AssertionError, ValueError) as error:
             raise AnswerError(f"{self.name}: {what} was answered by other samples than were asked for") from error
 

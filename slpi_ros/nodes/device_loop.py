@@ -17,8 +17,9 @@ from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import Limits, RateLimiter, volts
 from slpi_ros.nodes.device_block import BlockPlayer, BlockRequest, BlockState, Told, refusal
+from slpi_ros.nodes.device_pace import Pace
 
-# Time between two attempts to reach a device, and longest sleep of the thread, seconds.
+# Time between two attempts to reach a device, and longest wait of the thread for a command, seconds.
 RETRY, LONGEST_SLEEP = 0.25, 0.05
 # A voltage that was written may be reported for this time.
 BAND_NS = 3 * SECOND_NS // 10
@@ -78,6 +79,8 @@ class DeviceLoop:
     on_reading : called by the thread with each reading
     now_ns : the steady clock (ns)
 
+    Cycles fall in step with commands that come steadily, so that these are not written up to a cycle late (`Pace`).
+
     The first opening raises its error out of `run`. Nothing is written before the first command, and the first voltage
     starts from the one that the device had. After an error the device is opened anew until it succeeds; then it is only
     read until `arm`, or armed at once with ``rearm``.
@@ -108,6 +111,9 @@ class DeviceLoop:
         ]
         self._spans = spans
         self._lock = threading.Lock()
+        # Free once a command has come that no cycle has taken; an event would take several times longer.
+        self._commanded = threading.Lock()
+        self._commanded.acquire()
         self._goal: tuple[float, ...] | None = None  # V, of the last command
         self._requests: set[str] = set()
         self._written: tuple[float, ...] = ()
@@ -133,6 +139,8 @@ class DeviceLoop:
         else:
             with self._lock:
                 self._goal = tuple(voltages)
+                if self._commanded.locked():
+                    self._commanded.release()
             return ""
         self.counts.rejected += 1
         return reason
@@ -161,21 +169,16 @@ class DeviceLoop:
 
     def run(self) -> None:
         """Open the device and serve it until `end`; raise the error of the first opening."""
-        period_ns = round(SECOND_NS / self._settings.rate)
+        pace = Pace(round(SECOND_NS / self._settings.rate), self._now_ns())
         try:
-            due_ns = self._now_ns()
             while not self._ending or self._returning():
-                self._wait_until(due_ns)
+                self._wait(pace)
                 began_ns = self._now_ns()
                 if not self._lost:
-                    self.timing.note(due_ns, began_ns)
+                    self.timing.note(pace.due_ns, began_ns)
+                pace.begin(began_ns)
                 self.turn()
-                due_ns += period_ns
-                behind = (self._now_ns() - due_ns) // period_ns
-                if behind > 0:
-                    # No burst of cycles to make up for one that took long.
-                    self.counts.late += behind
-                    due_ns += behind * period_ns
+                self.counts.late += pace.leave_out(self._now_ns())
         finally:
             with suppress(DeviceError):
                 self._stop_block("the driver has ended")
@@ -183,6 +186,7 @@ class DeviceLoop:
 
     def turn(self) -> None:
         """Do one cycle: open the device; write what is due, and read; or try to reach it again."""
+        self._commanded.acquire(blocking=False)
         if self.status.state is State.OPENING:
             self._open(first=True)
             return
@@ -216,11 +220,11 @@ class DeviceLoop:
     def _lost(self) -> bool:
         return self.status.state is State.LOST
 
-    def _wait_until(self, due_ns: int) -> None:
-        while (wait := (due_ns - self._now_ns()) * 1e-9) > 0.0:
-            time.sleep(min(wait, LONGEST_SLEEP))
-            if self._ending:
-                return
+    def _wait(self, pace: Pace) -> None:
+        """Wait until a cycle is due, which a command may bring forward."""
+        while (wait := (pace.due_ns - self._now_ns()) * 1e-9) > 0.0 and not self._ending:
+            if self._commanded.acquire(timeout=min(wait, LONGEST_SLEEP)):
+                pace.note_command(self._now_ns())
 
     # Blocks
 

@@ -138,6 +138,12 @@ class DriverSettings:
         if 0.0 in values["sensor_scale"]:
             raise UsageError("parameter sensor_scale is 0; give metres for one unit of the device's position")
         low, high = (numbers(given, name, axes, *VOLTAGE) for name in ("voltage_min", "voltage_max"))
+        if swapped := [axis for axis, lowest, highest in zip(axes, low, high, strict=True) if lowest >= highest]:
+            at = axes.index(swapped[0])
+            raise UsageError(
+                f"axis '{swapped[0]}': voltage_min {low[at]:g} and voltage_max {high[at]:g} V; give voltage_min below "
+                "voltage_max"
+            )
         slew = slew_limits(values["slew_limit"], low, high)
         limits = tuple(
             Limits(lowest, highest, rate or math.inf) for lowest, highest, rate in zip(low, high, slew, strict=True)

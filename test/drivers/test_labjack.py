@@ -2,6 +2,7 @@
 
 import socket
 import struct
+import threading
 
 import pytest
 from pymodbus.client import ModbusTcpClient
@@ -106,3 +107,22 @@ def test_nobody_listens_and_somebody_else_does():
         device.close()
     with pytest.raises(LinkError, match="no connection"):
         device.open()
+
+
+def test_a_connection_that_is_reset_is_a_lost_link():
+    with socket.create_server(("127.0.0.1", 0)) as server:
+
+        def reset():
+            link, _ = server.accept()
+            link.recv(1)
+            # Closed at once, with bytes that nobody has read.
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+            link.close()
+
+        thread = threading.Thread(target=reset)
+        thread.start()
+        device = make_device("labjack", "{}:{}".format(*server.getsockname()), [Channel("DAC0:AIN0")])
+        with pytest.raises(LinkError, match="lost|no whole answer"):
+            device.open()
+        thread.join()
+        device.close()

@@ -209,6 +209,7 @@ def test_a_simulated_device_as_a_node(tmp_path, name):
         ({"device": "abacus"}, 2, "abacus"),
         ({"address": ""}, 2, "address"),
         ({"voltage_min": float("nan")}, 2, "voltage_min"),
+        ({"voltage_min": 110.0}, 2, "voltage_min 110 and voltage_max 100 V"),
         ({"channels": ["1", "2"]}, 2, "channels"),
         ({"sensor_scale": 0.0}, 2, "sensor_scale"),
         ({"at_exit": "rest", "rest_voltage": 200.0}, 2, "rest_voltage"),

@@ -1,6 +1,6 @@
 """Diagnosis of a model on records: its errors, their causes, and the model extended by them."""
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
 from typing import Any, NamedTuple
@@ -18,7 +18,7 @@ from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, 
 from slpi_ros.diagnosis.selection import CONVERGED, Named, Selection, select
 from slpi_ros.diagnosis.significance import counts, worse_on_none
 from slpi_ros.diagnosis.structures import BIAS
-from slpi_ros.effects.base import EffectContext
+from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.effects.chain import Chain
 from slpi_ros.effects.registry import EFFECTS, in_order
 from slpi_ros.errors import SlpiError, UsageError
@@ -47,6 +47,9 @@ LEFT_BY_UNSURE, MUCH_LEFT = 0.316, 3.0
 # Gauss-Newton steps of the selected effects with the hysteresis of the given model, which has more vertices; largest
 # ratio, either way, of the errors of the coarser one and with it that are as good.
 REFINED, COARSER = 3, 1.05
+# A stage has changed if a new fit leaves at most this multiple of what the model left of its own records, or at most
+# this share of what the model leaves: else something else than the hysteresis is the matter.
+AS_ONCE, LITTLE = 1.5, 0.2
 # A zero has moved if its shift exceeds this multiple of the error; number of parts for the uncertainty of a gain;
 # fewest samples of a comparison.
 ZERO, STRETCHES, FEWEST = 4.0, 8, 50
@@ -174,21 +177,27 @@ def _diagnose_axis(
     # Other kinds are not refitted; a comparison with the loop family shows whether they are suitable.
     fitted = model.kind in REFITTED
     family = evidence_of(records, axis, None, start, stop) if model.kind == "pi" else None
-    selection = _without_unsure(_selected(base, family if fitted else None))
-    runs = [_run(model, part, of_record=same) for part in selection.now.evidence.parts]
+    runs = [_run(model, part, of_record=same) for part in evidence.parts]
     before = base.held_out.rms_of_records if fitted else rms_of(runs)
-    if not fitted and before > WRONG_KIND * base.held_out.rms:
-        selection = replace(selection, structures=(BIAS, *selection.structures))
-    given = _given(model, runs, selection)
-    source = ", ".join(part.source for part in evidence.parts)
-    extension = _extension(model, selection, given, source)
-    if _of_another_kind(selection) or (extension and _not_as_judged(extension.with_own, runs, selection)):
-        # What was judged on held-out blocks is not what all records together give: the causes do not explain them.
-        selection = selection.without({named.name for named in selection.named})
-        given = _given(model, runs, selection)
-        extension = _extension(model, selection, given, source)
-        if extension and _not_as_judged(extension.with_own, runs, selection):
-            extension = None
+    other_kind = not fitted and before > WRONG_KIND * base.held_out.rms
+
+    def attempt(not_first: Collection[str]) -> _Attempt:
+        found = _selected(base, family if fitted else None, not_first)
+        if other_kind:
+            found = replace(found, structures=(BIAS, *found.structures))
+        return _attempt(model, found, runs)
+
+    made = attempt(())
+    begun = {effect.name for effect in made.beginnings[:1]}
+    named = {one.name for one in made.selection.named}
+    imitates = not named or any(EFFECTS[name].free_course for name in named)
+    if begun and imitates and _leaves_more(made.selection, ABOVE_NOISE) and not one_speed(evidence):
+        # What does not hold, or has a free course, may have been in the way of the causes: these count if they explain
+        # all.
+        again = attempt(begun)
+        if again.selection.named and not _leaves_more(again.selection, ABOVE_NOISE):
+            made = again
+    selection, given, extension = made.selection, made.given, made.extension
     if not (extension or selection.named):
         # Nothing is explained, so that nothing is fitted beside the hysteresis of the given kind.
         selection = replace(selection, now=selection.base)
@@ -200,6 +209,32 @@ def _diagnose_axis(
         return found, model
     diagnosed = replace(extension.model.quality, verdict=found.verdict)
     return found, replace(extension.model, quality=diagnosed)
+
+
+class _Attempt(NamedTuple):
+    """Selection of effects that hold, the comparison of the given model with the records, and its extension."""
+
+    selection: Selection
+    given: Given
+    extension: "_Extension | None"
+    # Effects with which the selection began, those that do not hold among them.
+    beginnings: tuple[Effect, ...]
+
+
+def _attempt(model: AxisModel, found: Selection, runs: Sequence[FreeRun]) -> _Attempt:
+    """Return what holds of a selection of effects; `runs` are the free runs of the given model."""
+    selection = _without_unsure(found)
+    given = _given(model, runs, selection)
+    source = ", ".join(part.source for part in selection.now.evidence.parts)
+    extension = _extension(model, selection, given, source)
+    if _of_another_kind(selection) or (extension and _not_as_judged(extension.with_own, runs, selection)):
+        # What was judged on held-out blocks is not what all records together give: the causes do not explain them.
+        selection = selection.without({named.name for named in selection.named})
+        given = _given(model, runs, selection)
+        extension = _extension(model, selection, given, source)
+        if extension and _not_as_judged(extension.with_own, runs, selection):
+            extension = None
+    return _Attempt(selection, given, extension, found.beginnings)
 
 
 class _Extension(NamedTuple):
@@ -230,7 +265,7 @@ def _without_unsure(selection: Selection) -> Selection:
     while _leaves_more(selection, ABOVE_NOISE):
         # Of several records, a common effect has held on those that are left out.
         one = len(selection.now.evidence.parts) == 1
-        unsure = [named for named in selection.named if _is_unsure(named) and (one or named.own)]
+        unsure = [named for named in selection.named if _is_unsure(named, selection.dropped) and (one or named.own)]
         left = selection.now.held_out.rms_of_records
         shares = {named.name: left / named.without.rms_of_records for named in unsure}
         if not shares or max(shares.values()) <= LEFT_BY_UNSURE:
@@ -239,8 +274,10 @@ def _without_unsure(selection: Selection) -> Selection:
     return selection
 
 
-def _is_unsure(named: Named) -> bool:
-    return EFFECTS[named.name].free_course or bool(named.alternatives)
+def _is_unsure(named: Named, dropped: Collection[str] = ()) -> bool:
+    effect = EFFECTS[named.name]
+    # What is left of a drift that was dropped looks like creep.
+    return effect.free_course or bool(named.alternatives) or effect.resembles_when_old in dropped
 
 
 def _leaves_more(selection: Selection, multiple: float) -> bool:
@@ -294,12 +331,12 @@ def _not_as_judged(after: Sequence[FreeRun], runs: Sequence[FreeRun], selection:
     return _leaves_more(selection, ABOVE_NOISE)
 
 
-def _selected(base: Explanation, of_family: Evidence | None) -> Selection:
+def _selected(base: Explanation, of_family: Evidence | None, not_first: Collection[str]) -> Selection:
     """Return the selection of effects, made with a coarser hysteresis if that is as good, and the joint fit without."""
     evidence, coarse = base.evidence, base.evidence.coarse
     quick = Explanation(coarse, base.effects) if coarse is not evidence else None
     if quick and quick.held_out.rms <= COARSER * base.held_out.rms:
-        selection = _of_kind(quick, of_family.coarse if of_family else None)
+        selection = _of_kind(quick, of_family.coarse if of_family else None, not_first)
         finest = of_family if of_family and BIAS in selection.structures else evidence
         # A smoothness that suits few vertices may leave many without any hold.
         finer = replace(selection.now.evidence, basis=finest.basis, smoothness=evidence.smoothness)
@@ -307,19 +344,19 @@ def _selected(base: Explanation, of_family: Evidence | None) -> Selection:
         if selection.now.held_out.rms <= COARSER * now.held_out.rms:
             as_good = now.held_out.rms <= COARSER * selection.now.held_out.rms
             return replace(selection, base=base, now=now) if as_good else selection
-    return _of_kind(base, of_family)
+    return _of_kind(base, of_family, not_first)
 
 
-def _of_kind(base: Explanation, of_family: Evidence | None) -> Selection:
+def _of_kind(base: Explanation, of_family: Evidence | None, not_first: Collection[str]) -> Selection:
     """Return the selection, with the loop family as hysteresis if clearly better than the kind of `base`."""
     if of_family is None:
-        return select(base, None)
+        return select(base, None, not_first)
     family = Explanation(of_family, base.effects)
     if counts(base.held_out, family.held_out):
-        return select(base, family)
-    selection = select(base, None)
+        return select(base, family, not_first)
+    selection = select(base, None, not_first)
     with_effects = Explanation(of_family, selection.now.effects).refined(2)
-    return select(base, family) if counts(selection.now.held_out, with_effects.held_out) else selection
+    return select(base, family, not_first) if counts(selection.now.held_out, with_effects.held_out) else selection
 
 
 def _repeatability(now: Explanation) -> Repeatability:
@@ -368,9 +405,24 @@ def _given(model: AxisModel, runs: Sequence[FreeRun], selection: Selection) -> G
     if model.kind in REFITTED and not own.any():
         span = max(motion, float(np.ptp(model.displacement_range)))
         require_own(best.hysteresis_rms, best.refitted_rms, span)
+    best = replace(best, explained=_fits_anew(model, selection, own, best.hysteresis_rms))
     zero = max((run.moved for run in runs), key=abs)
     moved = abs(zero) > ZERO * max(rms, CHANGED * motion)
     return replace(best, zero_moved=zero if moved else None)
+
+
+def _fits_anew(model: AxisModel, selection: Selection, own: Mask, given_rms: float) -> bool:
+    """Return whether effects, or a hysteresis fitted to each new record alone, leave as little as the model once did.
+
+    Or a small share of `given_rms` (m), the error of the given hysteresis. `own` are the records of the model, mask of
+    shape (records,).
+    """
+    evidence = selection.now.evidence
+    allowed = max(AS_ONCE * max(model.quality.held_out_rms, selection.now.noise), LITTLE * given_rms)
+    if min(selection.base.held_out.rms, selection.now.held_out.rms) <= allowed:
+        return True
+    alone = [Explanation(evidence.of_record(k)) for k in np.flatnonzero(~own).tolist()] if own.size > 1 else []
+    return bool(alone) and all(one.held_out.rms <= allowed for one in alone)
 
 
 def _compared(bare: AxisModel, one: Explanation) -> Given:
@@ -400,6 +452,7 @@ def _compared(bare: AxisModel, one: Explanation) -> Given:
         zero_moved=None,
         motion=0.0,
         own_rms=0.0,
+        explained=True,
     )
 
 
@@ -426,6 +479,7 @@ def _since(own: Mask, one: Explanation) -> Given:
         zero_moved=None,
         motion=0.0,
         own_rms=0.0,
+        explained=True,
     )
 
 

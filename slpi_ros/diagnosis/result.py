@@ -193,11 +193,12 @@ class Given:
     zero_moved: float | None  # m, largest among the records; None: small, or due to the initial state
     motion: float  # m, range of the measured displacement
     own_rms: float  # at the identification of the model, if these are its records, else 0
+    explained: bool  # whether a new fit leaves little
 
     @property
     def changed(self) -> bool:
         """Whether the stage has changed since the model was identified: its loops or its gain no longer fit."""
-        if self.own_rms <= AS_BEFORE * self.rms and self.rms <= AS_BEFORE * self.own_rms:
+        if not self.explained or (self.own_rms <= AS_BEFORE * self.rms and self.rms <= AS_BEFORE * self.own_rms):
             return False
         excess = np.sqrt(max(self.hysteresis_rms**2 - self.refitted_rms**2, 0.0))
         clear = self.hysteresis_rms > STALE * self.refitted_rms and excess > CHANGED * self.motion

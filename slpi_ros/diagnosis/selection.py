@@ -80,20 +80,27 @@ class Selection:
     rivals: Mapping[str, Sequence[Effect]] = field(default_factory=dict)
 
     def without(self, names: Collection[str]) -> "Selection":
-        """Return the selection without some of its effects, which count as dropped."""
+        """Return the selection without some of its effects, and those needed beside them only; all count as dropped."""
         now = self.now.only([effect.name for effect in self.now.effects if effect.name not in names])
-        if left := {name: rivals for name, rivals in self.rivals.items() if name not in names}:
-            now = now.refined(CONVERGED)
+        left = {name: rivals for name, rivals in self.rivals.items() if name not in names}
+        if left:
+            now = _without_needless(now.refined(CONVERGED), set(left), restart=False)
+        present = {effect.name for effect in now.effects}
+        left = {name: rivals for name, rivals in left.items() if name in present}
         named = _named(now.only([effect.name for effect in now.effects if effect.name not in left]), now, left)
-        return replace(self, now=now, named=named, dropped=tuple(sorted({*self.dropped, *names})), rivals=left)
+        dropped = {*self.dropped, *(one.name for one in self.named)} - left.keys()
+        return replace(self, now=now, named=named, dropped=tuple(sorted(dropped)), rivals=left)
 
 
-def select(base: Explanation, family: Explanation | None) -> Selection:
-    """Select effects, beginning with the best one, and with the next if that leaves much and more than the noise."""
+def select(base: Explanation, family: Explanation | None, not_first: Collection[str] = ()) -> Selection:
+    """Select effects, beginning with the best one, and with the next if that leaves much and more than the noise.
+
+    Not with an effect in `not_first`, which may be added later.
+    """
     # `family` is used instead of `base`: the same with the loop family as hysteresis, where that is better. Of two
     # effects a third one may imitate both, and better than either alone. At a single drive frequency nothing tells them
     # apart.
-    best = _grown(base, family)
+    best = _grown(base, family, not_first=not_first)
     beginnings = best.beginnings
     others = 0 if one_speed(base.evidence) else min(len(beginnings) - 1, FRESH_STARTS)
     for first in range(1, 1 + others):
@@ -112,7 +119,12 @@ def _beginning(now: Explanation, effect: Effect) -> Explanation:
     return with_companion(now, effect).adding(effect).refined(STEPS)
 
 
-def _grown(base: Explanation, family: Explanation | None, beginnings: tuple[Effect, ...] = ()) -> Selection:
+def _grown(
+    base: Explanation,
+    family: Explanation | None,
+    beginnings: tuple[Effect, ...] = (),
+    not_first: Collection[str] = (),
+) -> Selection:
     """Add effects as long as one has a significant gain, at first that of `beginnings`; remove needless ones."""
     structures: tuple[str, ...]
     now, structures = (family, (BIAS,)) if family else (base, ())
@@ -126,7 +138,8 @@ def _grown(base: Explanation, family: Explanation | None, beginnings: tuple[Effe
         rounds += 1
         report_progress(f"{len(now.effects)} effects found, {now.held_out.rms * 1e9:.3g} nm left, trying others")
         begun = rivals or not beginnings
-        found = contenders(now) if begun else [Contender(beginnings[0].name, _beginning(now, beginnings[0]))]
+        allowed = [name for name in EFFECTS if rivals or name not in not_first]
+        found = contenders(now, allowed) if begun else [Contender(beginnings[0].name, _beginning(now, beginnings[0]))]
         structure, with_structure = _best_structure(now, structures)
         if structure and (not found or _beats(with_structure.held_out, found[0].score)):
             now, structures = with_structure, (*structures, structure)

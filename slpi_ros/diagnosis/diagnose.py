@@ -14,7 +14,7 @@ from slpi_ros.diagnosis.candidates import contenders, is_own, seen
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
-from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged
+from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged, signals_of
 from slpi_ros.diagnosis.selection import CONVERGED, Named, Selection, select
 from slpi_ros.diagnosis.significance import counts, worse_on_none
 from slpi_ros.diagnosis.structures import BIAS
@@ -198,13 +198,15 @@ def _diagnose_axis(
         if again.selection.named and not _leaves_more(again.selection, ABOVE_NOISE):
             made = again
     selection, given, extension = made.selection, made.given, made.extension
+    # A hysteresis as smooth as beside the effects that were tried takes up less of what is left.
+    signals = signals_of(selection.now)
     if not (extension or selection.named):
         # Nothing is explained, so that nothing is fitted beside the hysteresis of the given kind.
         selection = replace(selection, now=selection.base)
     extension = extension or _Extension(model, runs, runs)
     outcomes = _outcomes(runs, extension.runs, selection.now)
     noise, repeats, alike = selection.now.noise, _repeatability(selection.now), driven_alike(records, axis)
-    found = judged(selection, noise, repeats, before, given, outcomes, alike)
+    found = judged(selection, signals, noise, repeats, before, given, outcomes, alike)
     if extension.model is model:
         return found, model
     diagnosed = replace(extension.model.quality, verdict=found.verdict)

@@ -207,6 +207,7 @@ class Given:
 
 def judged(
     selection: Selection,
+    signals: Sequence[Signals],
     noise_rms: float,
     repeatability: Repeatability,
     before_rms: float,
@@ -214,12 +215,14 @@ def judged(
     records: tuple[RecordOutcome, ...],
     driven_alike: Sequence[str],
 ) -> AxisDiagnosis:
-    """Return the diagnosis of one axis; `noise_rms` is that of the sensor, `before_rms` the held-out error (m)."""
+    """Return the diagnosis of one axis; `noise_rms` is that of the sensor, `before_rms` the held-out error (m).
+
+    `signals` hold what is left, of which the fingerprint is taken.
+    """
     # `driven_alike` are other axes with the same drive as this one.
     base, now = selection.base, selection.now
     effects = _named_effects(selection)
     verdict = _verdict(selection, effects, noise_rms)
-    signals = _signals(now)
     left = fingerprint(signals)
     return AxisDiagnosis(
         verdict=verdict,
@@ -292,7 +295,7 @@ def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], noise_rms: 
     return PARTLY_NAMED if more_than_noise else NAMED
 
 
-def _signals(now: Explanation) -> list[Signals]:
+def signals_of(now: Explanation) -> list[Signals]:
     """Return the used samples of each record with what a joint fit leaves."""
     evidence = now.evidence
     records = []
@@ -305,7 +308,8 @@ def _signals(now: Explanation) -> list[Signals]:
 
 def _goes_with(left: Sequence[Left], verdict: str, records: Sequence[Signals]) -> str:
     if left:
-        return f" Of what is left, {left[0].evidence}."
+        others = [f"{one.variable} ({one.share:.0%})" for one in left[1:]]
+        return f" Of what is left, {left[0].evidence}." + (f" Beside that: {', '.join(others)}." if others else "")
     if verdict not in (UNEXPLAINED, PARTLY_NAMED):
         return ""
     return (

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from slpi_ros.diagnosis.verify import PASSED, UNPROVED, RecordVerification, Verification
+from slpi_ros.diagnosis.verify import RecordVerification, Verification
 from slpi_ros.errors import SlpiError, length
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.io.digests import digests
@@ -44,7 +44,6 @@ class Verified:
     bags: Sequence[str]
     model: StageModel
     model_file: str
-    own: Sequence[str] = ()  # bags that the model was identified from
 
 
 def certificate(of: Verified) -> dict[str, Any]:
@@ -55,17 +54,17 @@ def certificate(of: Verified) -> dict[str, Any]:
         "schema": SCHEMA,
         "hardware_id": found.hardware_id or next((each.hardware_id for each in of.records if each.hardware_id), ""),
         "issued": datetime.now(UTC).isoformat(timespec="seconds"),
-        "verdict": _proved(found.verdict, of),
+        "verdict": found.verdict,
         "tolerance_m": found.tolerance,
         "method": list(METHOD),
         "model": {"source": of.model_file, "sha256": digest, "created": of.model.created},
         "records": [
-            _record(record, bag, of.model, independent=bag not in of.own)
-            for record, bag in zip(of.records, of.bags, strict=True)
+            _record(record, bag, of.model, independent=one.independent)
+            for record, bag, one in zip(of.records, of.bags, next(iter(found.axes.values())).records, strict=True)
         ],
         "axes": {
             name: {
-                "verdict": _proved(axis.verdict, of),
+                "verdict": axis.verdict,
                 **_model(of.model.axes[name]),
                 "rms_m": axis.overall.rms,
                 "maximum_m": axis.overall.maximum,
@@ -82,11 +81,6 @@ def certificate(of: Verified) -> dict[str, Any]:
         },
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in PROGRAMS}},
     }
-
-
-def _proved(verdict: str, of: Verified) -> str:
-    """Return the verdict, `UNPROVED` instead of `PASSED` where the model was identified from all records."""
-    return UNPROVED if verdict == PASSED and set(of.bags) <= set(of.own) else verdict
 
 
 def write_files(folder: Path, document: dict[str, Any]) -> None:

@@ -84,7 +84,10 @@ def verification_limits(found: Verification) -> dict[str, str]:
         said = []
         if not axis.passed:
             worst, unproved = axis.worst, axis.verdict == UNPROVED
-            limit = "unproved" if unproved else _limiting(worst)
+            limit = _limiting(worst)
+            if unproved:
+                own = "" if axis.unproved.independent else " on a record that the model was identified from"
+                limit = f"unproved{own}"
             said.append(f"{limit}, {length(worst.judged_error)} rms where {length(worst.limit)} are allowed")
         path = max(tracked, key=lambda tracking: tracking.error.rms, default=None)
         if path and path.error.rms > max(axis.worst.limit, axis.worst.judged_error):
@@ -146,13 +149,13 @@ def describe_verification(found: Verification, *, details: bool = True) -> list[
 
 def _summary(name: str, axis: AxisVerification) -> str:
     """Return a sentence with the error and its limit, and the remedy for an axis that does not pass."""
-    several = f" on the worst of {len(axis.records)} records" if len(axis.records) > 1 else ""
+    several = f" on the worst of {len(axis.counted)} records" if len(axis.counted) > 1 else ""
     said = f"Axis {name}: {_error(axis.worst)}{several}."
     if axis.passed:
         moved = [record for record in axis.records if record.zero_moved]
         return said + (f" The zero has moved by {_um(moved[0].offset)} µm; the loops are the same." if moved else "")
     if axis.verdict == UNPROVED:
-        return f"{said} {_why_unproved(next(one for one in axis.records if one.verdict == UNPROVED))}"
+        return f"{said} {_why_unproved(axis.unproved)}"
     limit = _limiting(axis.worst)
     if limit == LINES:
         return f"{said} It is {LINES}, no error of the model."
@@ -162,9 +165,11 @@ def _summary(name: str, axis: AxisVerification) -> str:
 
 
 def _why_unproved(record: RecordVerification) -> str:
-    """Return why nothing is proved: readings that are no use, or the initial state, and what to do."""
+    """Return why nothing is proved (useless readings, the initial state, a record of the fit), and what to do."""
     if record.unusable >= 1.0 - LEAST:
         return "Too few readings are left: check the sensor and its link, 'slpi doctor' tells what is wrong with them."
+    if record.share >= LEAST and record.judged_error <= record.limit and not record.independent:
+        return "The model was identified from this record, so that a small error proves nothing: record another one."
     if record.share >= LEAST:
         return (
             f"The initial state is unknown, which alone can be {length(record.offset_uncertainty)}: begin a record "
@@ -217,6 +222,8 @@ def record_notes(record: RecordVerification) -> list[str]:
         notes.append(f"errors are those of the stage; taken out of the readings of its sensor: {record.corrected}")
     if record.zero_moved:
         notes.append(f"the zero has moved by {_um(record.offset)} µm")
+    if not record.independent:
+        notes.append("the model was identified from this bag: a small error on it proves nothing")
     if not record.passed:
         notes.append(f"relative to the model, gain {record.gain:+.2%}, loop width {record.width:+.2%}")
     if record.beyond:

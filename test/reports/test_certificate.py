@@ -18,6 +18,7 @@ from slpi_ros.model.axis_model import Start
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.model.uncertainty import COMPONENTS
 from slpi_ros.reports.uncertainty import PLACES, TIMES
+from slpi_ros.reports.verification import FILES
 
 NOISE = 8e-9
 BEGINS = datetime(2026, 5, 6, 7, 8, 9, tzinfo=UTC)
@@ -93,10 +94,16 @@ def test_a_record_of_the_model_proves_nothing(folder, verify):
     model = slpi_ros.load_model(folder / "model.json")
     own = replace(model.axes["x"], quality=replace(QUALITY, source="today"))
     slpi_ros.save_model(replace(model, axes={"x": own}), folder / "own.json")
-    verify("--model", "own.json", "--certificate", "-o", "own")
-    document = json.loads((folder / "own" / "certificate.json").read_text())
+    code, said, _ = verify("--model", "own.json", "--certificate", "-o", "own")
+    assert code == 1 and "unproved" in said.splitlines()[0] and said.splitlines()[-1].startswith("next: slpi verify")
+    document, judged = (json.loads((folder / "own" / name).read_text()) for name in ("certificate.json", FILES[0]))
     assert not document["records"][0]["independent"]
-    assert document["verdict"] == document["axes"]["x"]["verdict"] == "unproved"
+    for axis in (document["axes"]["x"], judged["axes"]["x"]):
+        assert {document["verdict"], axis["verdict"], *(one["verdict"] for one in axis.get("errors", []))} == {
+            "unproved"
+        }
+    (one,) = judged["axes"]["x"]["records"]
+    assert (one["verdict"], one["passed"], one["independent"]) == ("unproved", False, False)
     assert "proves nothing on today" in (folder / "own" / "certificate.html").read_text()
 
 

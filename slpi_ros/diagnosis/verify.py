@@ -81,6 +81,8 @@ class RecordVerification:
     tracking: Tracking | None = None  # None: the desired displacement is not known
     corrected: str = ""  # what was taken out of the readings, as known of the sensor
     independent: bool = True  # the model was not identified from it
+    lacking: tuple[str, ...] = ()  # quantities that the model follows and the record does not hold
+    holds: tuple[str, ...] = ()  # those that it holds
 
     @property
     def share(self) -> float:
@@ -322,7 +324,7 @@ def verify(
         for name in names:
             axis, run = surrounded.axis(name), runs[name]
             one = _judge(run, axis, record.source, tolerance, without_offset=without_offset)
-            one = replace(one, independent=record.source not in own)
+            one = replace(one, independent=record.source not in own, holds=tuple(record.surroundings))
             if path is not None and name in path:
                 followed = path[name][np.isfinite(record.voltage[name])][: run.t.size]
                 # From a known state nothing but the zero adds a constant.
@@ -517,6 +519,7 @@ def _judge(
         judged=judged,
         lines=lines_of(Signals(t, v, y, rest), LINES),
         corrected=axis.describe_correction(),
+        lacking=tuple(one.key for one in axis.followed if one.key not in axis.surroundings),
     )
 
 

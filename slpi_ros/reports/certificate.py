@@ -221,7 +221,7 @@ def _show_budget(page: Page, uncertainty: dict[str, Any]) -> None:
 
 def _quantities(uncertainty: dict[str, Any]) -> str:
     """Return what the budget takes for the quantities that the model follows; "" if it follows none."""
-    values = {one["name"]: one["value"] for one in uncertainty["surroundings"]}
+    values = {one["name"]: one["value"] for one in uncertainty["quantities"]}
     known = ", ".join(f"{name} {value:.4g}" for name, value in values.items() if value is not None)
     lacking = ", ".join(name for name, value in values.items() if value is None)
     told = (
@@ -231,7 +231,7 @@ def _quantities(uncertainty: dict[str, Any]) -> str:
     )
     told += f" Not recorded, and not known in the budget: {lacking}." if lacking else ""
     if known:
-        told += f" Where none is known, 'surroundings' is {length(uncertainty['unknown_surroundings_m'])} instead."
+        told += f" Where none is known, 'surroundings' is {length(uncertainty['unknown_quantities_m'])} instead."
     return told
 
 

@@ -61,8 +61,8 @@ def uncertainty_document(axis: AxisModel, known: Mapping[str, float]) -> dict[st
     return {
         "coverage_factor": COVERAGE_FACTOR,
         "unknown_memory_m": unknown_memory(axis),
-        "surroundings": [{"name": one.key, "value": known.get(one.key)} for one in axis.followed],
-        "unknown_surroundings_m": float(unknown),
+        "quantities": [{"name": one.key, "value": known.get(one.key)} for one in axis.followed],
+        "unknown_quantities_m": float(unknown),
         "budget": [
             {
                 "time_s": seconds,

@@ -10,7 +10,14 @@ from slpi_ros.io.desired import desired_of
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import StartMemory
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.workflows.records import Findings, Source, mismatch_in_data, require_for_model, shared_axes
+from slpi_ros.workflows.records import (
+    Findings,
+    Source,
+    mismatch_in_data,
+    require_followed,
+    require_for_model,
+    shared_axes,
+)
 
 
 @dataclass(frozen=True)
@@ -52,6 +59,7 @@ def verify(request: VerifyRequest) -> VerifyOutcome:
     with mismatch_in_data():
         source = replace(source, axes=shared_axes(records, model, source))
         found = require_for_model(records, model, source)
+        require_followed(records, source, model)
         told = verification.verify(
             records, model, request.tolerance, axes=source.axes, desired=desired, without_offset=request.without_offset,
             start=source.start, stop=source.stop, start_memory=request.start_memory,

@@ -142,8 +142,8 @@ def test_the_budget_takes_quantities_as_they_were_recorded(recorded, folder):
     text = (folder / "follows" / "certificate.html").read_text()
     budget, (kept,) = document["axes"]["x"]["uncertainty"], document["records"]
     unknown = 1e-7 * 4.0 / 12.0**0.5
-    assert budget["unknown_surroundings_m"] == pytest.approx(unknown)
-    assert budget["surroundings"] == [{"name": "/room", "value": 22.0 if recorded else None}]
+    assert budget["unknown_quantities_m"] == pytest.approx(unknown)
+    assert budget["quantities"] == [{"name": "/room", "value": 22.0 if recorded else None}]
     own = 1e-9 if recorded else unknown
     assert [each["surroundings_m"] for each in budget["budget"]] == pytest.approx([own] * len(budget["budget"]))
     assert kept["not_recorded"] == ([] if recorded else ["/room"])

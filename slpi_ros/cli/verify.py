@@ -4,7 +4,6 @@ import math
 import shlex
 from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
-from pathlib import Path
 
 from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Command, Result, command_line
@@ -50,6 +49,7 @@ def _add_options(command: ArgumentParser) -> None:
 
 
 def _run(options: Namespace) -> Result:
+    from slpi_ros.diagnosis.verify import UNPROVED
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.io.schemas import format_document
     from slpi_ros.model.document import load_model
@@ -76,37 +76,31 @@ def _run(options: Namespace) -> Result:
     names = (*FILES, *certificates.FILES) if options.certificate else FILES
     if options.output is not None:
         common.allow_folder(options, options.output, *names, inputs=[options.model])
-    # Those of the calibrator are named by their place beside the model.
-    places = Path(), Path(options.model).parent
-    known = {(at / bag).resolve() for axis in model.axes.values() for bag in axis.quality.sources for at in places}
-    fitted = [bag for bag in options.bags if Path(bag).resolve() in known]
-    own = [
-        f"{bag}: the model was identified from this bag; an error on it proves nothing, record another one"
-        for bag in fitted
-    ]
     with nullcontext() if options.output is None else output_folder(options.output, *names) as folder:
         request = VerifyRequest(
-            source, model, tolerance, options.desired_topic, options.without_offset, options.start_memory
+            source, model, tolerance, options.desired_topic, options.without_offset, options.start_memory, options.model
         )
         done = verify(request)
         found = done.verification
         if folder:
             write_files(folder, found)
         if folder and options.certificate:
-            of = certificates.Verified(found, done.records, options.bags, model, options.model, fitted)
+            of = certificates.Verified(found, done.records, options.bags, model, options.model)
             certificates.write_files(folder, certificates.certificate(of))
     if found.passed:
         next_command = f"slpi compensate {shlex.quote(options.model)} DESIRED.csv -o VOLTAGE.csv"
+    elif found.verdict == UNPROVED and not any(done.independent):
+        next_command = f"slpi verify OTHER_BAG --model {shlex.quote(options.model)}"
     else:
         next_command = command_line(
             "slpi", "diagnose", *options.bags, "--model", options.model, "-o", "diagnosis", *common.same_record(options)
         )
     return Result(
-        [*describe_verification(found, details=False), *own],
+        describe_verification(found, details=False),
         format_document(found.to_document(), "verification"),
         next_command,
         verdict(verification_limits(found), verification_good(found)) + little_judged(found),
-        [*describe_verification(found), *own],
+        describe_verification(found),
         found.passed,
     )
 

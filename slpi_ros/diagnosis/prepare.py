@@ -22,7 +22,7 @@ from slpi_ros.identification.published_kinds import voltage_dead_band
 from slpi_ros.identification.refit import basis_of
 from slpi_ros.identification.samples import Samples, select_samples
 from slpi_ros.identification.signal_statistics import digit
-from slpi_ros.io.record import Record
+from slpi_ros.io.record import Course, Record
 from slpi_ros.io.surroundings import averaging, clean, smoothed
 from slpi_ros.model.axis_model import AxisModel
 
@@ -271,12 +271,34 @@ def _readings(
     return t[chosen], samples, {name: y[chosen] for name, y in others.items()}
 
 
+def no_cause(course: Course, begins: float, ends: float) -> str:
+    """Return why a recorded quantity can be no cause of what is between two times (s); "" if it can."""
+    _, value = clean(course)
+    if reason := few(course) or uncovered(course, begins, ends):
+        return reason
+    return f"it stays at {value[0]:.4g}" if np.ptp(value) == 0.0 else ""
+
+
+def few(course: Course) -> str:
+    """Return how many readings a quantity has, and how many are needed; "" if it has enough."""
+    at, _ = clean(course)
+    return "" if at.size >= FEWEST_READINGS else f"{at.size} readings, at least {FEWEST_READINGS} are needed"
+
+
+def uncovered(course: Course, begins: float, ends: float) -> str:
+    """Return which time the readings of a quantity cover; "" if it is most of that between two times (s)."""
+    at, _ = clean(course)
+    if at.size and min(at[-1], ends) - max(at[0], begins) >= ENOUGH_TIME * (ends - begins):
+        return ""
+    covers = f"its readings go from {at[0]:.4g} to {at[-1]:.4g} s" if at.size else "it has no reading"
+    return f"{covers} where {begins:.4g} to {ends:.4g} s are in use, of which {ENOUGH_TIME:.0%} are needed"
+
+
 def _at_stamps(record: Record, t: FloatArray) -> dict[str, FloatArray]:
     """Return the quantities of a record at times `t`, shape (N,), s, that were recorded over most of that."""
     found = {}
     for key, course in record.surroundings.items():
-        at, _ = clean(course)
-        if at.size >= FEWEST_READINGS and min(at[-1], t[-1]) - max(at[0], t[0]) >= ENOUGH_TIME * (t[-1] - t[0]):
+        if not (few(course) or uncovered(course, float(t[0]), float(t[-1]))):
             found[key] = np.interp(t, *smoothed(course))
     return found
 

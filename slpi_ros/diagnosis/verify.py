@@ -80,6 +80,9 @@ class RecordVerification:
     lines: Left | None = None  # of the spectrum of the rest; None: they hold little of it
     tracking: Tracking | None = None  # None: the desired displacement is not known
     corrected: str = ""  # what was taken out of the readings, as known of the sensor
+    independent: bool = True  # the model was not identified from it
+    lacking: tuple[str, ...] = ()  # quantities that the model follows and the record does not hold
+    holds: tuple[str, ...] = ()  # those that it holds
 
     @property
     def share(self) -> float:
@@ -104,11 +107,17 @@ class RecordVerification:
 
     @property
     def verdict(self) -> str:
-        """`PASSED`, `FAILED`, or `UNPROVED`: too few samples are judged, or the state alone may exceed the limit."""
+        """`PASSED`, `FAILED`, or `UNPROVED`.
+
+        Nothing is proved if too few samples are judged, if the state alone may exceed the limit, or if the error is
+        small on a record that the model was identified from.
+        """
         hidden = self.absolute and not self.begins_known and self.offset_uncertainty > self.limit
         if self.share < LEAST or (hidden and self.rest.rms <= self.limit):
             return UNPROVED
-        return PASSED if self.judged_error <= self.limit else FAILED
+        if self.judged_error > self.limit:
+            return FAILED
+        return PASSED if self.independent else UNPROVED
 
     @property
     def passed(self) -> bool:
@@ -126,6 +135,7 @@ class RecordVerification:
             "source": self.error.name,
             "verdict": self.verdict,
             "passed": self.passed,
+            "independent": self.independent,
             "samples": self.error.samples,
             "share": self.share,
             "rms_m": self.error.rms,
@@ -166,18 +176,31 @@ class AxisVerification:
 
     @property
     def verdict(self) -> str:
-        """The worst verdict of the records: `FAILED`, then `UNPROVED`, then `PASSED`."""
-        return worst_verdict([record.verdict for record in self.records])
+        """The worst verdict of the records: `FAILED`, then `UNPROVED`, then `PASSED`.
+
+        Where other records are there, those that the model was identified from only count if they fail.
+        """
+        return worst_verdict([one.verdict for one in self.counted])
+
+    @property
+    def counted(self) -> tuple[RecordVerification, ...]:
+        """The records that decide about the verdict."""
+        return tuple(one for one in self.records if one.independent or one.verdict == FAILED) or self.records
 
     @property
     def passed(self) -> bool:
-        """Whether every record passes."""
+        """Whether every record passes that the model was not identified from, and no other fails."""
         return self.verdict == PASSED
 
     @property
+    def unproved(self) -> RecordVerification:
+        """The record that says why nothing is proved, where the verdict is `UNPROVED`."""
+        return next(one for one in self.counted if one.verdict == UNPROVED)
+
+    @property
     def worst(self) -> RecordVerification:
-        """Record with the largest ratio of error to limit."""
-        return max(self.records, key=lambda one: one.judged_error / one.limit if one.limit else np.inf)
+        """Record with the largest ratio of error to limit, of those that count."""
+        return max(self.counted, key=lambda one: one.judged_error / one.limit if one.limit else np.inf)
 
     def to_document(self) -> dict[str, Any]:
         """Return the figures as in ``msg_schemas/verification.schema.json``."""
@@ -217,7 +240,7 @@ class Verification:
 
     @property
     def passed(self) -> bool:
-        """Whether every axis passes on every record."""
+        """Whether every axis passes."""
         return self.verdict == PASSED
 
     def to_document(self) -> dict[str, Any]:
@@ -243,6 +266,7 @@ def verify(
     start: float | None = None,
     stop: float | None = None,
     start_memory: StartMemory | None = None,
+    own: Sequence[str] = (),
 ) -> Verification:
     """Verify a model by free-run simulation of records not used for its identification.
 
@@ -268,6 +292,8 @@ def verify(
     start_memory : {"end", "start", "wiped"}, optional
         Initial state of every record, as of `StageModel.compensate`; by default that at an end of the model's voltage
         range if a record begins there, else an estimated one.
+    own : sequence of str, optional
+        Sources of the records that the model was identified from: a small error on them proves nothing. Default none.
 
     Returns
     -------
@@ -298,6 +324,7 @@ def verify(
         for name in names:
             axis, run = surrounded.axis(name), runs[name]
             one = _judge(run, axis, record.source, tolerance, without_offset=without_offset)
+            one = replace(one, independent=record.source not in own, holds=tuple(record.surroundings))
             if path is not None and name in path:
                 followed = path[name][np.isfinite(record.voltage[name])][: run.t.size]
                 # From a known state nothing but the zero adds a constant.
@@ -492,6 +519,7 @@ def _judge(
         judged=judged,
         lines=lines_of(Signals(t, v, y, rest), LINES),
         corrected=axis.describe_correction(),
+        lacking=tuple(one.key for one in axis.followed if one.key not in axis.surroundings),
     )
 
 

@@ -45,7 +45,7 @@ class SignalQuality:
     high: float
     noise: float  # rms, from reading to reading
     digit: float  # resolution; 0: none found
-    missing: int  # NaN
+    missing: int  # NaN or infinite
     stuck: int  # repeated readings in runs of three or more while the other signal moves
     longest_stuck: int
     clipped: int  # stuck readings at the lowest or the highest value
@@ -53,6 +53,7 @@ class SignalQuality:
     spikes: int  # other single outliers
     mixed: int = 0  # early, late or a mixture of two neighbouring values
     mixed_share: float = 0.0  # of those tested, which are not next to a reversal
+    infinite: int = 0
     mixed_size: float = 0.0  # typical largest error: half the change between the neighbours
 
     @property
@@ -156,7 +157,7 @@ def _whole_signal(parts: list[SignalQuality]) -> SignalQuality:
     """Return the quality of readings examined in parts: sums of counts, medians of noise, resolution and sizes."""
     if len(parts) == 1:
         return parts[0]
-    counts = ("missing", "stuck", "clipped", "stale", "spikes", "mixed")
+    counts = ("missing", "infinite", "stuck", "clipped", "stale", "spikes", "mixed")
     sizes = [part.mixed_size for part in parts if part.mixed]
     return SignalQuality(
         low=min(part.low for part in parts),
@@ -202,6 +203,7 @@ def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality
     """Return the quality of voltage and displacement, shape (N,) each."""
     both = np.isfinite(v) & np.isfinite(y)
     missing = [int(np.count_nonzero(~np.isfinite(signal))) for signal in (v, y)]
+    infinite = [int(np.count_nonzero(np.isinf(signal))) for signal in (v, y)]
     if not both.all():
         t, v, y = t[both], v[both], y[both]
     far_v, far_y = bad_readings.far_outliers(v, y)
@@ -220,8 +222,9 @@ def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality
         size, share = float(np.median(ways)), mixed.size / judged
         displacement = replace(displacement, mixed=int(mixed.size), mixed_share=share, mixed_size=size)
     voltage = _signal(v, missing[0], noise_v, digit_v, stopped, off_v)
-    voltage = replace(voltage, spikes=voltage.spikes + np.setdiff1d(far_v, off_v).size)
-    return voltage, replace(displacement, spikes=displacement.spikes + np.setdiff1d(far_y, off_y).size)
+    voltage = replace(voltage, spikes=voltage.spikes + np.setdiff1d(far_v, off_v).size, infinite=infinite[0])
+    spikes = displacement.spikes + np.setdiff1d(far_y, off_y).size
+    return voltage, replace(displacement, spikes=spikes, infinite=infinite[1])
 
 
 def _signal(
@@ -282,6 +285,8 @@ _COARSE = 1.5
 _NOISY_VOLTAGE, _NOISY_DISPLACEMENT = 2e-4, 0.01
 # Share of visited pairs of reversal voltage and present voltage below which a warning is given.
 _FEW_PAIRS = 0.4
+# Share of samples with the stamp of the one before from which two recordings may be mixed.
+_DOUBLED = 0.05
 # Limits beyond which no fit is possible: resolution as a share of the range, readings between reversals.
 _USELESS_DIGIT, _USELESS_RUN = 0.05, 4.0
 
@@ -373,8 +378,10 @@ def _voltage(v: SignalQuality) -> Iterator[Finding]:
 
 
 def _readings(name: str, signal: SignalQuality, samples: int) -> Iterator[Finding]:
-    if signal.missing:
-        yield Finding("warn", f"{name} missing (nan) for {_of(signal.missing, samples)}")
+    if missing := signal.missing - signal.infinite:
+        yield Finding("warn", f"{name} missing (nan) for {_of(missing, samples)}")
+    if signal.infinite:
+        yield Finding("warn", f"{name} infinite for {_of(signal.infinite, samples)}: check the link; they are not used")
     if signal.clipped:
         text = f"{name} clipped at an end of its range for {_of(signal.clipped, samples)}"
         yield Finding("warn", f"{text}: what goes further is not seen")
@@ -409,6 +416,14 @@ def _drive_findings(quality: Quality) -> Iterator[Finding]:
     if per_run < _USELESS_RUN:
         rate = 25.0 / (drive.samples_per_run * clock.period)
         text = f"{per_run:.2g} readings from turn to turn"
+        if clock.duplicates > _DOUBLED * clock.samples:
+            yield Finding(
+                "stop",
+                f"{text}, {_of(clock.duplicates, clock.samples)} with the stamp of the one before: two recordings in "
+                "one, after a clock was set back or from two drivers; leave that part out (--start, --stop) or record "
+                "again",
+            )
+            return
         yield Finding("stop", f"{text}: record {rate:.2g} samples per second or more, all of them, or drive slower")
         return
     yield _warn_if(

@@ -227,10 +227,18 @@ def windows(v: FloatArray, first: int, until: int) -> Iterator[tuple[int, int]]:
 
 
 def _require_order(record: Record) -> None:
-    at = first_step_back(record.time_ns)
+    stamps, at = record.time_ns, first_step_back(record.time_ns)
     if at is not None:
-        seconds = (int(record.time_ns[at]) - int(record.time_ns[0])) * 1e-9
-        raise RecordError(f"{record.source}: time runs backwards at sample {at} (t = {seconds:.6g} s); sort the record")
+        before, then = ((int(stamps[k]) - int(stamps[0])) * 1e-9 for k in (at - 1, at))
+        raise RecordError(
+            f"{record.source}: stamps go back by {before - then:.4g} s at message {at + 1} of {len(record)}, from "
+            f"{before:.6g} to {then:.6g} s: use the part before it (--stop {before:.6g}), or record again"
+        )
+    if len(record) >= FEWEST and stamps[0] == stamps[-1]:
+        raise RecordError(
+            f"{record.source}: all {len(record)} messages have one stamp, so that nothing can be said of time; record "
+            "the stamps of the sensor"
+        )
 
 
 def _require_enough(record: Record, axis: str, count: int, start: float | None, stop: float | None) -> None:

@@ -28,6 +28,7 @@ class Signals:
     frame_id: str  # the first that is not empty
     fields: Mapping[str, Mapping[str, FloatArray]]  # ``position``, ``effort``, ``data`` or ``vector``; NaN: not given
     named: bool  # the message type names the columns, otherwise they are ``0``, ``1``, ...
+    note: str = ""  # on the order of the messages, which are sorted
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -82,7 +83,12 @@ def combine(voltage: Signals, displacement: Signals, topics: SeparateTopics, axe
         displacement=y,
         source=str(path),
         hardware_id=displacement.frame_id or voltage.frame_id,
-        notes=(*notes, *_naming(voltage, topics.voltage, wanted), *_naming(displacement, topics.displacement, wanted)),
+        notes=(
+            *dict.fromkeys(filter(None, (voltage.note, displacement.note))),
+            *notes,
+            *_naming(voltage, topics.voltage, wanted),
+            *_naming(displacement, topics.displacement, wanted),
+        ),
     )
 
 

@@ -20,7 +20,7 @@ from slpi_ros.io.bag_files import absolute_name, locate, match_topic, require_bo
 from slpi_ros.io.bag_storage import MessageBlock, read_mcap, read_sqlite
 from slpi_ros.io.input_limits import MOST_AXES, require_count
 from slpi_ros.io.messages import JOINT_STATE, MESSAGE_TYPES, QUANTITY_TYPES, SECOND_NS, Message, kind_of, read_message
-from slpi_ros.io.record import BLOCK, Course, Record, each_block, first_step_back, new_column, release
+from slpi_ros.io.record import BLOCK, Course, Record, each_block, new_column, order_note, release
 from slpi_ros.io.surroundings import MOST, Chosen, courses, since_start_of, topics_beside
 
 _Path = str | os.PathLike[str]
@@ -76,13 +76,14 @@ def read_bag(
 
 
 def _record_of(state: Signals, chosen: Sequence[str], path: Path) -> Record:
+    unstamped = () if state.stamp is not None else ("time is that of recording: the messages are not stamped",)
     return Record(
         time_ns=state.logged if state.stamp is None else state.stamp,
         voltage={axis: state.fields["effort"][axis] for axis in chosen},
         displacement={axis: state.fields["position"][axis] for axis in chosen},
         source=str(path),
         hardware_id=state.frame_id,
-        notes=() if state.stamp is not None else ("time is that of recording: the messages are not stamped",),
+        notes=(*([state.note] if state.note else []), *unstamped),
     )
 
 
@@ -256,7 +257,8 @@ def decode_signals(blocks: Iterable[MessageBlock], msgtype: str, expected: int =
         return None
     arrays = columns.arrays()
     logged, stamp = arrays[_LOGGED], arrays[_STAMP]
-    if first_step_back(logged) is not None:
+    note = order_note(logged)
+    if note:
         order = np.argsort(logged, kind="stable")
         arrays = {key: array[order] for key, array in arrays.items()}
         logged, stamp = arrays[_LOGGED], arrays[_STAMP]
@@ -266,7 +268,7 @@ def decode_signals(blocks: Iterable[MessageBlock], msgtype: str, expected: int =
         if field:
             fields[field][name] = array
     stamped = any(part.any() for (part,) in each_block(stamp))
-    return Signals(logged, stamp if stamped else None, frame_id, fields, kind.named)
+    return Signals(logged, stamp if stamped else None, frame_id, fields, kind.named, note)
 
 
 # Key of a column: field and name; for times the field is empty.

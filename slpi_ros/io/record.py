@@ -19,6 +19,8 @@ from slpi_ros.io.input_limits import LONGEST_NAME, MOST_AXES
 Course = tuple[FloatArray, FloatArray]
 # Columns of this size and above, in bytes, are kept in a temporary file.
 MAPPED_FROM = 32 * 2**20
+# How the note on a record begins whose messages were sorted; steps back (ns) from which a clock may have been set back.
+OUT_OF_ORDER, SET_BACK_NS = "messages are not in the order of their stamps", 10**9
 # Number of samples of a block, where a long record is worked on in blocks.
 BLOCK = 1_000_000
 # Mappings made here. Another one may be private: its changes would be lost with its memory.
@@ -64,6 +66,25 @@ def first_step_back(times: IntArray) -> int | None:
         if back.any():
             return number * BLOCK + int(np.argmax(back)) + 1
     return None
+
+
+def order_note(times: IntArray) -> str:
+    """Return how many messages have an earlier time (ns) than the one before them, and the largest step; else ""."""
+    count, largest, at = 0, 0, 0
+    for number, (part,) in enumerate(each_block(times)):
+        steps = part[:-1] - part[1:]
+        count += int(np.count_nonzero(steps > 0))
+        if steps.size and steps.max() > largest:
+            largest, at = int(steps.max()), number * BLOCK + int(np.argmax(steps)) + 1
+    if not count:
+        return ""
+    told = (
+        f"{OUT_OF_ORDER}: {count} of {times.size} come after a later one, message {at + 1} by {largest * 1e-9:.4g} s; "
+        "they are sorted"
+    )
+    if largest < SET_BACK_NS:
+        return told
+    return f"{told}; if a clock was set back, leave that part out with --start or --stop, or record again"
 
 
 def is_axis_name(axis: str) -> bool:

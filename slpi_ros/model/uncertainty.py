@@ -230,10 +230,14 @@ class AxisUncertainty:
             surroundings=np.sqrt(self._surroundings_square(values, y)),
         )
 
-    def at(self, y: float, age: float) -> Budget:
-        """Return the budget, shape (1,), at a displacement (m) and a time (s) since a reset, at rates of the record."""
+    def at(self, y: float, age: float, surroundings: Mapping[str, float] | None = None) -> Budget:
+        """Return the budget, shape (1,), at a displacement (m) and a time (s) since a reset, at rates of the record.
+
+        `surroundings` are known values of the quantities that the stage follows, by name, in their units.
+        """
         known = self if self.known_memory else AxisUncertainty(self._axis, self._start_memory, known_memory=True)
-        return known.budget(np.zeros(1), np.array([y]), np.zeros(1), age)
+        values = {key: np.array([value]) for key, value in (surroundings or {}).items()}
+        return known.budget(np.zeros(1), np.array([y]), np.zeros(1), age, values)
 
     def _memory_square(self, v: FloatArray) -> FloatArray:
         if self.known_memory:

@@ -1,7 +1,7 @@
 """The certificate of a verification: a page and a document for the files of a laboratory."""
 
 import platform
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from slpi_ros.diagnosis.verify import PASSED, UNPROVED, RecordVerification, Verification
+from slpi_ros.diagnosis.verify import FAILED, RecordVerification, Verification
 from slpi_ros.errors import SlpiError, length
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.io.digests import digests
@@ -44,28 +44,28 @@ class Verified:
     bags: Sequence[str]
     model: StageModel
     model_file: str
-    own: Sequence[str] = ()  # bags that the model was identified from
 
 
 def certificate(of: Verified) -> dict[str, Any]:
     """Return the certificate as a document, ``msg_schemas/certificate.schema.json``; RecordError if a file is gone."""
     found = of.verification
     ((_, digest),) = digests(of.model_file).items()
+    known = _middles(of.records, of.model)
     return {
         "schema": SCHEMA,
         "hardware_id": found.hardware_id or next((each.hardware_id for each in of.records if each.hardware_id), ""),
         "issued": datetime.now(UTC).isoformat(timespec="seconds"),
-        "verdict": _proved(found.verdict, of),
+        "verdict": found.verdict,
         "tolerance_m": found.tolerance,
         "method": list(METHOD),
         "model": {"source": of.model_file, "sha256": digest, "created": of.model.created},
         "records": [
-            _record(record, bag, of.model, independent=bag not in of.own)
-            for record, bag in zip(of.records, of.bags, strict=True)
+            _record(record, bag, of.model, independent=one.independent)
+            for record, bag, one in zip(of.records, of.bags, next(iter(found.axes.values())).records, strict=True)
         ],
         "axes": {
             name: {
-                "verdict": _proved(axis.verdict, of),
+                "verdict": axis.verdict,
                 **_model(of.model.axes[name]),
                 "rms_m": axis.overall.rms,
                 "maximum_m": axis.overall.maximum,
@@ -76,17 +76,12 @@ def certificate(of: Verified) -> dict[str, Any]:
                     _errors(one, of.model.surrounded(record).axes[name], _age(of.model, record))
                     for one, record in zip(axis.records, of.records, strict=True)
                 ],
-                **_uncertainty(of.model.axes[name]),
+                **_uncertainty(of.model.axes[name], known),
             }
             for name, axis in found.axes.items()
         },
         "versions": {"python": platform.python_version(), **{name: _version(name) for name in PROGRAMS}},
     }
-
-
-def _proved(verdict: str, of: Verified) -> str:
-    """Return the verdict, `UNPROVED` instead of `PASSED` where the model was identified from all records."""
-    return UNPROVED if verdict == PASSED and set(of.bags) <= set(of.own) else verdict
 
 
 def write_files(folder: Path, document: dict[str, Any]) -> None:
@@ -125,9 +120,26 @@ def write_files(folder: Path, document: dict[str, Any]) -> None:
 
 def _verdict(document: dict[str, Any]) -> str:
     own = [record["source"] for record in document["records"] if not record["independent"]]
-    worst = max(axis["rms_m"] for axis in document["axes"].values())
     dependent = f" It proves nothing on {', '.join(own)}, from which the model was identified." if own else ""
-    return f"The absolute error of the model is {length(worst)} rms on the worst axis.{dependent}"
+    counted = [one for axis in document["axes"].values() for one in _counted(axis, own)]
+    worst = max(counted, key=lambda one: one[one["limit_of"]] / one["limit_m"] if one["limit_m"] else np.inf)
+    several = {"axis": len(document["axes"]), "record": len({one["source"] for one in counted})}
+    among = [what for what, count in several.items() if count > 1]
+    where = f" on the worst {' and '.join(among)}" if among else ""
+    limit = f"{where} (limit {length(worst['limit_m'])})"
+    if worst["limit_of"] == "rms_m":
+        return f"The absolute error of the model is {length(worst['rms_m'])} rms{limit}.{dependent}"
+    why = "the tolerance is not for it" if document["tolerance_m"] else "no tolerance for it was given"
+    return (
+        f"The error of the model without its constant part is {length(worst['rest_rms_m'])} rms{limit}; the absolute "
+        f"error is {length(max(one['rms_m'] for one in counted))}: {why}.{dependent}"
+    )
+
+
+def _counted(axis: dict[str, Any], own: Sequence[str]) -> list[dict[str, Any]]:
+    """Return the errors on the records that decide about the verdict of an axis, as in `AxisVerification.counted`."""
+    errors: list[dict[str, Any]] = axis["errors"]
+    return [one for one in errors if one["source"] not in own or one["verdict"] == FAILED] or errors
 
 
 def _show_axis(page: Page, name: str, axis: dict[str, Any]) -> None:
@@ -154,13 +166,21 @@ def _show_axis(page: Page, name: str, axis: dict[str, Any]) -> None:
     rows = [
         (
             str(number), one["verdict"], f"{one['samples']:,} ({one['share']:.0%})", _nm(one["rms_m"]),
-            _nm(one["maximum_m"]), f"{one['constant_m'] * 1e9:+.1f}", _nm(one["rest_rms_m"]),
+            _nm(one["maximum_m"]), f"{one['constant_m'] * 1e9:+z.1f}", _nm(one["rest_rms_m"]),
             _nm(one["rest_maximum_m"]), _nm(one["limit_m"]),
             "not known" if one["within_expanded"] is None else f"{one['within_expanded']:.1%}",
         )
         for number, one in enumerate(axis["errors"], 1)
     ]  # fmt: skip
-    page.table(header, rows, caption="Errors in nm, with the offset and without it; u: combined standard uncertainty.")
+    judged = "rms" if axis["errors"][0]["limit_of"] == "rms_m" else "rms without"
+    offset = "with" if judged == "rms" else "without"
+    page.table(
+        header,
+        rows,
+        caption=f"Errors in nm, with the offset and without it. The limit holds for '{judged}'. Within 2 u: share of "
+        f"the judged samples whose error {offset} the offset is within twice the combined standard uncertainty u, the "
+        "noise of the sensor included.",
+    )
     page.lines([f"record {k}: {remark}" for k, one in enumerate(axis["errors"], 1) for remark in one["remarks"]])
     page.section("Budget of uncertainty")
     if axis["uncertainty"] is None:
@@ -180,13 +200,13 @@ def _show_budget(page: Page, uncertainty: dict[str, Any]) -> None:
             ("expanded", f"combined, with the coverage factor {COVERAGE_FACTOR:g}"),
         )
     ]
-    unknown = " The values of the recorded quantities count as not known." if middle[0]["surroundings_m"] else ""
     page.table(
         ("component", "what it is", *TIMES),
         rows,
         caption="Standard uncertainty (nm) of the displacement that the model promises, at the middle of the range, by "
         "the time since the last reset or calibration. Without a reset, besides "
-        f"{length(uncertainty['unknown_memory_m'])} at first, until the voltage has gone over its range.{unknown}",
+        f"{length(uncertainty['unknown_memory_m'])} at first, until the voltage has gone over its range."
+        f"{_quantities(uncertainty)}",
     )
     places = [budget[k :: len(PLACES)] for k in range(len(PLACES))]
     page.table(
@@ -199,18 +219,35 @@ def _show_budget(page: Page, uncertainty: dict[str, Any]) -> None:
     )  # fmt: skip
 
 
+def _quantities(uncertainty: dict[str, Any]) -> str:
+    """Return what the budget takes for the quantities that the model follows; "" if it follows none."""
+    values = {one["name"]: one["value"] for one in uncertainty["quantities"]}
+    known = ", ".join(f"{name} {value:.4g}" for name, value in values.items() if value is not None)
+    lacking = ", ".join(name for name, value in values.items() if value is None)
+    told = (
+        f" Quantities that the model follows are taken as known, in the middle of their range: {known}."
+        if known
+        else ""
+    )
+    told += f" Not recorded, and not known in the budget: {lacking}." if lacking else ""
+    if known:
+        told += f" Where none is known, 'surroundings' is {length(uncertainty['unknown_quantities_m'])} instead."
+    return told
+
+
 def _nm(metres: float) -> str:
     return f"{metres * 1e9:.1f}"
 
 
 def _record_facts(one: dict[str, Any]) -> dict[str, str]:
     conditions = [f"{each['name']} {each['lowest']:.4g} to {each['highest']:.4g}" for each in one["surroundings"]]
+    conditions += [f"{name}, which the model follows, was not recorded" for name in one["not_recorded"]]
     return {
         "bag": one["source"],
         "begins": one["begins"],
         "duration": f"{one['duration_s']:.1f} s",
         "independent": "yes" if one["independent"] else "no: the model was identified from it",
-        "surroundings": ", ".join(conditions) or "not recorded",
+        "surroundings": ", ".join(conditions) or "none that the model follows",
         **{f"SHA-256 of {name}": digest for name, digest in one["files"].items()},
     }
 
@@ -218,6 +255,7 @@ def _record_facts(one: dict[str, Any]) -> dict[str, str]:
 def _record(record: Record, bag: str, model: StageModel, *, independent: bool) -> dict[str, Any]:
     begins, ends = int(record.time_ns[0]), int(record.time_ns[-1])
     known = {key: record.surroundings[key][1] for key in model.quantities if key in record.surroundings}
+    known = {key: values for key, values in known.items() if np.isfinite(values).any()}
     return {
         "source": bag,
         "files": digests(bag),
@@ -227,8 +265,8 @@ def _record(record: Record, bag: str, model: StageModel, *, independent: bool) -
         "surroundings": [
             {"name": key, "lowest": float(np.nanmin(values)), "highest": float(np.nanmax(values))}
             for key, values in known.items()
-            if np.isfinite(values).any()
         ],
+        "not_recorded": [key for key in model.quantities if key not in known],
     }
 
 
@@ -274,9 +312,21 @@ def _age(model: StageModel, record: Record) -> float:
     return max(seconds_since(model.created, int(record.time_ns[0]) * 1e-9) or 0.0, 0.0)
 
 
-def _uncertainty(axis: AxisModel) -> dict[str, Any]:
+def _middles(records: Sequence[Record], model: StageModel) -> dict[str, float]:
+    """Return the quantities that a model follows and the records hold, each in the middle of its range in them."""
+    found = {}
+    for key in model.quantities:
+        values = [record.surroundings[key][1] for record in records if key in record.surroundings]
+        known = [value[np.isfinite(value)] for value in values]
+        if any(value.size for value in known):
+            both = np.concatenate(known)
+            found[key] = float(both.min() + both.max()) / 2.0
+    return found
+
+
+def _uncertainty(axis: AxisModel, known: Mapping[str, float]) -> dict[str, Any]:
     try:
-        return {"uncertainty": uncertainty_document(axis), "uncertainty_unknown": ""}
+        return {"uncertainty": uncertainty_document(axis, known), "uncertainty_unknown": ""}
     except SlpiError as error:
         return {"uncertainty": None, "uncertainty_unknown": str(error)}
 

@@ -136,7 +136,7 @@ def _show_records(page: Page, found: AxisDiagnosis) -> None:
         rows = [
             [
                 each.source,
-                f"{each.offset * 1e6:+.3g}",
+                f"{'+' if each.offset > 0.0 else ''}{length(each.offset + 0.0)}",
                 *(length(rms) for rms in (each.before_rms, each.after_rms)),
                 "-" if each.left_out_rms is None else length(each.left_out_rms),
             ]
@@ -146,7 +146,7 @@ def _show_records(page: Page, found: AxisDiagnosis) -> None:
             "Offset: by how much the zero has moved against the given model. Errors, rms, without it; held out: by a "
             "fit to the other records."
         )
-        header = ("Record", "offset (µm)", "given model", "extended model", "held out")
+        header = ("Record", "offset", "given model", "extended model", "held out")
         page.table(header, rows, None, caption)
 
 
@@ -192,6 +192,8 @@ def _value(name: str, value: object, uncertainty: Mapping[str, float]) -> str:
         case float() | int():
             scale = 1.0 if name.rpartition(".")[2] == "phase" else abs(value)
             return _estimate(value, uncertainty.get(name), scale)
+        case None | [] | ():
+            return "none"
         case [Mapping(), *_]:
             return "; ".join(_value(f"{name}.{k}", one, uncertainty) for k, one in enumerate(value))
         case list() | tuple():

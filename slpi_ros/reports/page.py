@@ -3,6 +3,7 @@
 import base64
 import html
 import io
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
@@ -69,7 +70,7 @@ class Page:
         """Add the summary sentence of an axis, after an optional word; its element has the id ``verdict-<axis>``."""
         name, before = _text(f"verdict-{axis}"), f"<b>{_text(word.replace('_', ' '))}</b> " if word else ""
         said = f' data-verdict="{_text(word)}"' if word else ""
-        self._parts.append(f'<p class="verdict {severity}" id="{name}"{said}>{before}{_text(text)}</p>')
+        self._parts.append(f'<p class="verdict {severity}" id="{name}"{said}>{before}{_prose(text)}</p>')
 
     def tiles(self, figures: Mapping[str, str]) -> None:
         """Add key figures by name."""
@@ -78,7 +79,7 @@ class Page:
 
     def findings(self, found: Iterable[Finding]) -> None:
         """Add the findings on a record."""
-        items = (f'<li><b class="{one.level}">{one.level}</b>{_text(one.text)}</li>' for one in found)
+        items = (f'<li><b class="{one.level}">{one.level}</b>{_prose(one.text)}</li>' for one in found)
         self._parts.append(f'<ul class="findings">{"".join(items)}</ul>')
 
     def shares(self, parts: Sequence[Share]) -> None:
@@ -98,7 +99,7 @@ class Page:
         self._parts.append(
             f'<figure class="chart"><div id="{_text(name)}" style="min-height:{chart.height}px"></div>'
             f'<script type="application/json">{chart.to_json()}</script>'
-            f"<figcaption>{_text(caption)}</figcaption></figure>"
+            f"<figcaption>{_prose(caption)}</figcaption></figure>"
         )
 
     def section(self, text: str) -> None:
@@ -111,16 +112,16 @@ class Page:
 
     def text(self, text: str) -> None:
         """Add a paragraph."""
-        self._parts.append(f"<p>{_text(text)}</p>")
+        self._parts.append(f"<p>{_prose(text)}</p>")
 
     def definitions(self, texts: Mapping[str, str]) -> None:
         """Add a list of terms and their definitions."""
-        items = (f"<dt>{_text(term)}</dt><dd>{_text(text)}</dd>" for term, text in texts.items())
+        items = (f"<dt>{_text(term)}</dt><dd>{_prose(text)}</dd>" for term, text in texts.items())
         self._parts.append(f"<dl>{''.join(items)}</dl>")
 
     def lines(self, lines: Sequence[str]) -> None:
         """Add a list of short lines."""
-        self._parts.append(f"<ul>{''.join(f'<li>{_text(line)}</li>' for line in lines)}</ul>")
+        self._parts.append(f"<ul>{''.join(f'<li>{_prose(line)}</li>' for line in lines)}</ul>")
 
     def table(
         self,
@@ -131,7 +132,7 @@ class Page:
         links: Mapping[str, str] | None = None,
     ) -> None:
         """Add a table; row `best` is highlighted, a row of text is a group heading, first cells may be `links`."""
-        below = f"<caption>{_text(caption)}</caption>" if caption else ""
+        below = f"<caption>{_prose(caption)}</caption>" if caption else ""
         cells_of = [row for row in rows if not isinstance(row, str)]
         # Sentences and paths are aligned like text and broken into lines; numbers are neither.
         worded = {k for row in cells_of for k, cell in enumerate(row) if k and len(cell) > _SENTENCE}
@@ -146,7 +147,7 @@ class Page:
             if isinstance(row, str):
                 body.append(f'<tr class="group"><td colspan="{len(header)}">{_text(row)}</td></tr>')
                 continue
-            texts = [_text(cell) for cell in row]
+            texts = [_prose(cell) for cell in row]
             if links and row[0] in links:
                 texts[0] = f'<a href="{html.escape(quote(links[row[0]]))}">{texts[0]}</a>'
             cells = line("td", texts)
@@ -159,7 +160,7 @@ class Page:
         picture = base64.b64encode(png(figure)).decode()
         self._parts.append(
             f'<figure><img alt="{_text(caption)}" src="data:image/png;base64,{picture}">'
-            f"<figcaption>{_text(caption)}</figcaption></figure>"
+            f"<figcaption>{_prose(caption)}</figcaption></figure>"
         )
 
     def write(self, path: Path) -> None:
@@ -180,6 +181,11 @@ class Page:
 
 def _text(text: str) -> str:
     return html.escape(shown(text, _LONGEST_TEXT))
+
+
+def _prose(text: str) -> str:
+    """Return a text with what stands between backticks, such as a command, as code."""
+    return re.sub("`([^`]+)`", r"<code>\1</code>", _text(text))
 
 
 def _asset(name: str) -> str:

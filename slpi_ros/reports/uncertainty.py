@@ -1,5 +1,6 @@
 """The uncertainty of a model as text, and as part of a document: over time and over range, and its budget."""
 
+from collections.abc import Mapping
 from dataclasses import fields
 from math import sqrt
 from typing import Any
@@ -50,22 +51,32 @@ def unknown_memory(axis: AxisModel) -> float:
     return sqrt(own.memory_square(own.initial_voltage, own.initial_voltage))
 
 
-def uncertainty_document(axis: AxisModel) -> dict[str, Any]:
-    """Return the uncertainty of an axis as part of a certificate; ModelError if it is not known."""
+def uncertainty_document(axis: AxisModel, known: Mapping[str, float]) -> dict[str, Any]:
+    """Return the uncertainty of an axis as part of a certificate; ModelError if it is not known.
+
+    `known` are values of quantities that the stage follows, by name, in their units.
+    """
     own = AxisUncertainty(axis, known_memory=True)
+    (unknown,) = _at(own, MIDDLE, TIMES["1 s"]).surroundings
     return {
         "coverage_factor": COVERAGE_FACTOR,
         "unknown_memory_m": unknown_memory(axis),
+        "quantities": [{"name": one.key, "value": known.get(one.key)} for one in axis.followed],
+        "unknown_quantities_m": float(unknown),
         "budget": [
-            {"time_s": seconds, "displacement_m": own.low + share * own.stroke, **_figures(_at(own, share, seconds))}
+            {
+                "time_s": seconds,
+                "displacement_m": own.low + share * own.stroke,
+                **_figures(_at(own, share, seconds, known)),
+            }
             for seconds in TIMES.values()
             for share in PLACES
         ],
     }
 
 
-def _at(own: AxisUncertainty, share: float, seconds: float) -> Budget:
-    return own.at(own.low + share * own.stroke, seconds)
+def _at(own: AxisUncertainty, share: float, seconds: float, known: Mapping[str, float] | None = None) -> Budget:
+    return own.at(own.low + share * own.stroke, seconds, known)
 
 
 def _figures(budget: Budget) -> dict[str, float]:

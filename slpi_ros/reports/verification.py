@@ -84,7 +84,10 @@ def verification_limits(found: Verification) -> dict[str, str]:
         said = []
         if not axis.passed:
             worst, unproved = axis.worst, axis.verdict == UNPROVED
-            limit = "unproved" if unproved else _limiting(worst)
+            limit = _limiting(worst)
+            if unproved:
+                own = "" if axis.unproved.independent else " on a record that the model was identified from"
+                limit = f"unproved{own}"
             said.append(f"{limit}, {length(worst.judged_error)} rms where {length(worst.limit)} are allowed")
         path = max(tracked, key=lambda tracking: tracking.error.rms, default=None)
         if path and path.error.rms > max(axis.worst.limit, axis.worst.judged_error):
@@ -102,6 +105,8 @@ def _part(tracking: Tracking) -> str:
 
 def _limiting(record: RecordVerification) -> str:
     """Return what makes most of the error of a record that fails."""
+    if record.lacking:
+        return f"{', '.join(record.lacking)}, which the model follows and the record does not hold"
     if record.absolute and record.zero_moved and record.constant**2 > record.error.rms**2 / 2:
         return ZERO
     share = record.lines.share if record.lines else 0.0
@@ -146,25 +151,41 @@ def describe_verification(found: Verification, *, details: bool = True) -> list[
 
 def _summary(name: str, axis: AxisVerification) -> str:
     """Return a sentence with the error and its limit, and the remedy for an axis that does not pass."""
-    several = f" on the worst of {len(axis.records)} records" if len(axis.records) > 1 else ""
+    several = f" on the worst of {len(axis.counted)} records" if len(axis.counted) > 1 else ""
     said = f"Axis {name}: {_error(axis.worst)}{several}."
+    lacking = next((record for record in axis.records if record.lacking), None)
+    if lacking:
+        said = f"Axis {name}: {_lacking(lacking)} {said.removeprefix(f'Axis {name}: ')}"
     if axis.passed:
         moved = [record for record in axis.records if record.zero_moved]
         return said + (f" The zero has moved by {_um(moved[0].offset)} µm; the loops are the same." if moved else "")
     if axis.verdict == UNPROVED:
-        return f"{said} {_why_unproved(next(one for one in axis.records if one.verdict == UNPROVED))}"
+        return f"{said} {_why_unproved(axis.unproved)}"
     limit = _limiting(axis.worst)
     if limit == LINES:
         return f"{said} It is {LINES}, no error of the model."
     if limit == ZERO:
         return f"{said} The zero has moved: '~/set_zero' of the compensator, or judge --without-offset."
+    if lacking:
+        return said
     return f"{said} 'slpi diagnose' finds the cause, 'slpi refit' corrects the model."
 
 
+def _lacking(record: RecordVerification) -> str:
+    """Return which quantities that the model follows are not in a record, what is there, and what to do."""
+    held = f"it holds {', '.join(record.holds)}" if record.holds else "it holds no other"
+    return (
+        f"{record.error.name} does not hold {', '.join(record.lacking)}, which the model follows ({held}): the "
+        "reference value is taken; record it too, under this name."
+    )
+
+
 def _why_unproved(record: RecordVerification) -> str:
-    """Return why nothing is proved: readings that are no use, or the initial state, and what to do."""
+    """Return why nothing is proved (useless readings, the initial state, a record of the fit), and what to do."""
     if record.unusable >= 1.0 - LEAST:
         return "Too few readings are left: check the sensor and its link, 'slpi doctor' tells what is wrong with them."
+    if record.share >= LEAST and record.judged_error <= record.limit and not record.independent:
+        return "The model was identified from this record, so that a small error proves nothing: record another one."
     if record.share >= LEAST:
         return (
             f"The initial state is unknown, which alone can be {length(record.offset_uncertainty)}: begin a record "
@@ -178,7 +199,7 @@ def _error(record: RecordVerification) -> str:
     limit = "" if record.absolute else ", for the rest"
     return (
         f"measured - model is {length(error.rms)} rms, {length(error.maximum)} at most; of it constant "
-        f"{_um(record.constant)} µm, the rest {length(record.rest.rms)} rms (limit {length(record.limit)}{limit}; "
+        f"{length(record.constant)}, the rest {length(record.rest.rms)} rms (limit {length(record.limit)}{limit}; "
         f"repeatability {length(record.repeatability_rms)}); {_judged_share(record)}"
     )
 
@@ -217,8 +238,10 @@ def record_notes(record: RecordVerification) -> list[str]:
         notes.append(f"errors are those of the stage; taken out of the readings of its sensor: {record.corrected}")
     if record.zero_moved:
         notes.append(f"the zero has moved by {_um(record.offset)} µm")
+    if not record.independent:
+        notes.append("the model was identified from this bag: a small error on it proves nothing")
     if not record.passed:
-        notes.append(f"relative to the model, gain {record.gain:+.2%}, loop width {record.width:+.2%}")
+        notes.append(f"relative to the model, gain {record.gain:+z.2%}, loop width {record.width:+z.2%}")
     if record.beyond:
         notes.append(f"{record.beyond}: the model extrapolates there")
     return notes
@@ -277,7 +300,7 @@ def _figures(axis: AxisVerification) -> dict[str, str]:
 
 def _records_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence[str]], None, str]:
     header = (
-        "record", "", "judged", "rms (nm)", "maximum (nm)", "constant (µm)", "rest (nm)", "limit (nm)",
+        "record", "", "judged", "rms (nm)", "maximum (nm)", "constant (nm)", "rest (nm)", "limit (nm)",
     )  # fmt: skip
     rows: list[Sequence[str]] = [
         (
@@ -285,7 +308,7 @@ def _records_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence
             record.verdict,
             f"{record.error.samples:,} ({record.share:.0%})",
             *(f"{x * 1e9:.1f}" for x in (record.error.rms, record.error.maximum)),
-            _um(record.constant),
+            f"{record.constant * 1e9:+z.1f}",
             *(f"{x * 1e9:.1f}" for x in (record.rest.rms, record.limit)),
         )
         for record in axis.records
@@ -351,4 +374,4 @@ def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
 
 
 def _um(metres: float) -> str:
-    return f"{metres * 1e6:+.3f}"
+    return f"{metres * 1e6:+z.3f}"

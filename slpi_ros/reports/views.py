@@ -206,7 +206,7 @@ def _some_runs(v: FloatArray, y: FloatArray, motion: Motion) -> tuple[FloatArray
         [*(start + thin_line(y[start : stop + 1], v[start : stop + 1], most=_POINTS_OF_RUN)).tolist(), np.nan]
         for start, stop in zip(motion.runs[:-1:every].tolist(), motion.runs[1::every].tolist(), strict=True)
     ]
-    return np.concatenate(samples), f"Of {count} branches every {every}th is drawn."
+    return np.concatenate(samples), f"Of {count} branches one in {every} is drawn."
 
 
 def over_time(

@@ -7,7 +7,14 @@ from slpi_ros.diagnosis import diagnose as diagnosis
 from slpi_ros.diagnosis.result import Diagnosis
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.workflows.records import Findings, Source, mismatch_in_data, require_for_model, shared_axes
+from slpi_ros.workflows.records import (
+    Findings,
+    Source,
+    mismatch_in_data,
+    require_causes,
+    require_for_model,
+    shared_axes,
+)
 
 
 @dataclass(frozen=True)
@@ -34,5 +41,6 @@ def diagnose(request: DiagnoseRequest) -> DiagnoseOutcome:
     with mismatch_in_data():
         source = replace(source, axes=shared_axes(records, model, source))
         found = require_for_model(records, model, source)
+        require_causes(records, source)
         told = diagnosis.diagnose(records, model, axes=source.axes, start=source.start, stop=source.stop)
     return DiagnoseOutcome(told, records, found)

@@ -10,7 +10,7 @@ from slpi_ros.identification.uncertainty import CurveUncertainty, curve_uncertai
 from slpi_ros.io.record import Record
 from slpi_ros.model.sensor import IDEAL, Sensor, corrected
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.workflows.records import Findings, Source, require_records
+from slpi_ros.workflows.records import Findings, Source, require_causes, require_records
 
 
 @dataclass(frozen=True)
@@ -85,5 +85,6 @@ def identify(request: IdentifyRequest) -> IdentifyOutcome:
     )
     unmoved: Sequence[str] = ()
     if source.surroundings:
+        require_causes(records, source)
         model, unmoved = following(records, model, start=source.start, stop=source.stop)
     return IdentifyOutcome(request, model, records, found, unmoved)

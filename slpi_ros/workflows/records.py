@@ -1,14 +1,16 @@
 """Reading of the records of a request, and the decision whether they can be used."""
 
-from collections.abc import Iterator, Mapping, Sequence
+import warnings
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
+from slpi_ros.diagnosis.prepare import no_cause, uncovered
 from slpi_ros.errors import IdentificationError, ModelError, RecordError, SlpiError, UsageError
 from slpi_ros.identification.record_quality import Finding, assess, findings, require_usable
 from slpi_ros.io.alignment import SeparateTopics
 from slpi_ros.io.bag_reader import read_bag, require_different, require_one_stage
-from slpi_ros.io.record import Record
+from slpi_ros.io.record import OUT_OF_ORDER, Course, Record, first_step_back
 from slpi_ros.io.surroundings import named_in
 from slpi_ros.model.sensor import IDEAL, Sensor, corrected
 from slpi_ros.model.stage_model import StageModel
@@ -42,7 +44,7 @@ class Source:
         """Return the records; with `coupled`, also axes that are not in use, which may couple into the others."""
         if self.records:
             return tuple(_with_chosen(record, self.surroundings) for record in self.records)
-        records = tuple(self._read(str(bag), coupled) for bag in require_different(self.bags))
+        records = tuple(self._ordered(self._read(str(bag), coupled)) for bag in require_different(self.bags))
         require_one_stage(records)
         return records
 
@@ -56,6 +58,13 @@ class Source:
             if not self.axes:
                 raise
             return read_bag(bag, self.topic, axes=self.axes, surroundings=self.surroundings)
+
+    def _ordered(self, record: Record) -> Record:
+        """Return a record without what comes after stamps that go back, where `stop` leaves it out anyway."""
+        at = None if self.stop is None else first_step_back(record.time_ns)
+        if at is None or self.stop is None or (int(record.time_ns[at - 1]) - int(record.time_ns[0])) * 1e-9 < self.stop:
+            return record
+        return record.part(slice(at))
 
     def for_model(self, model: StageModel) -> "Source":
         """Return the source with the quantities that a model follows, if any, unless others are named."""
@@ -71,6 +80,55 @@ def _with_chosen(record: Record, chosen: Sequence[str] | None) -> Record:
             held = ", ".join(record.surroundings) or "none"
             raise RecordError(f"{record.source}: no quantity '{text}'; it holds {held}; name one of them (--with)")
     return replace(record, surroundings=named_in(record.surroundings, chosen))
+
+
+def require_causes(records: Sequence[Record], source: Source) -> None:
+    """Warn of named quantities that can be no cause; RecordError if none of them can."""
+    _require_named(records, source, lambda record, _, course: no_cause(course, *_span(record, source)))
+
+
+def require_followed(records: Sequence[Record], source: Source, model: StageModel) -> None:
+    """Warn of named quantities that a model does not follow, or not over the record; RecordError if it follows none."""
+    follows = f"it follows {', '.join(model.quantities)}" if model.quantities else "it follows none"
+
+    def why(_: Record, key: str, __: Course) -> str:
+        return "" if key in model.quantities else f"the model does not follow it; {follows}"
+
+    _require_named(records, source, why)
+    for record in records if source.surroundings and not source.records else ():
+        for key, course in record.surroundings.items():
+            if key in model.quantities and (gap := uncovered(course, *_span(record, source))):
+                warnings.warn(f"{record.source}: {key}: {gap}; beyond them the nearest one is taken", stacklevel=2)
+
+
+def _require_named(records: Sequence[Record], source: Source, why_not: Callable[[Record, str, Course], str]) -> None:
+    """Warn of each named quantity with a reason against it; RecordError if there is one against each of them."""
+    # The records of a fleet are those of many stages, of which not each has every quantity.
+    if not source.surroundings or source.records:
+        return
+    reasons: list[str] = []
+    usable = False
+    for text in source.surroundings:
+        against: dict[str, str] = {}
+        for record in records:
+            for key, course in named_in(record.surroundings, [text]).items():
+                if why := why_not(record, key, course):
+                    against.setdefault(key, f"{record.source}: {key} is not used: {why}")
+        usable |= any(
+            named_in({key: course}, [text]) for key, course in records[0].surroundings.items() if key not in against
+        )
+        reasons += against.values()
+    if not usable:
+        raise RecordError(f"{'; '.join(reasons)}; name other quantities (--with), or none")
+    for reason in reasons:
+        warnings.warn(reason, stacklevel=2)
+
+
+def _span(record: Record, source: Source) -> tuple[float, float]:
+    """Return the time (s) of the part of a record that is in use."""
+    ends = (int(record.time_ns[-1]) - int(record.time_ns[0])) * 1e-9
+    begins = 0.0 if source.start is None else min(max(source.start, 0.0), ends)
+    return begins, ends if source.stop is None else max(min(source.stop, ends), begins)
 
 
 @dataclass(frozen=True)
@@ -91,7 +149,9 @@ def assess_record(record: Record, source: Source, sensors: Mapping[str, Sensor] 
             found[axis] = findings(assess(sensed, axis, start=source.start, stop=source.stop))
             require_usable(found[axis], f"{record.source}: axis '{axis}'")
         except SlpiError as error:
-            refused[axis] = UnusableRecordError(str(error), found) if axis in found else error
+            reason = next((note for note in record.notes if note.startswith(OUT_OF_ORDER)), "")
+            said = f"{record.source}: axis '{axis}': {reason}" if reason else str(error)
+            refused[axis] = UnusableRecordError(said, found) if axis in found else error
     return Assessment(found, refused)
 
 

@@ -8,7 +8,7 @@ from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.refit import AxisChange
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.workflows.records import Source, require_for_model, shared_axes
+from slpi_ros.workflows.records import Source, require_followed, require_for_model, shared_axes
 
 
 @dataclass(frozen=True)
@@ -43,6 +43,7 @@ def refit(request: RefitRequest) -> RefitOutcome:
     records = sorted(source.read(coupled=True), key=lambda record: int(record.time_ns[0]))
     for record in records:
         require_for_model([record], model, replace(source, axes=shared_axes([record], model, source)))
+    require_followed(records, source, model)
     for record in records:
         report_progress(f"refit to {record.source}")
         model, changes = correction.refit(model, record, axes=source.axes, start=source.start, stop=source.stop)

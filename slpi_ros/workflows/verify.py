@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 from slpi_ros.diagnosis import verify as verification
 from slpi_ros.diagnosis.verify import Verification
@@ -9,7 +10,14 @@ from slpi_ros.io.desired import desired_of
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import StartMemory
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.workflows.records import Findings, Source, mismatch_in_data, require_for_model, shared_axes
+from slpi_ros.workflows.records import (
+    Findings,
+    Source,
+    mismatch_in_data,
+    require_followed,
+    require_for_model,
+    shared_axes,
+)
 
 
 @dataclass(frozen=True)
@@ -22,6 +30,7 @@ class VerifyRequest:
     desired_topic: str | None = None  # default: ``desired_displacement``, where a bag has it
     without_offset: bool = False  # the tolerance holds for the error without its constant part
     start_memory: StartMemory | None = None  # initial state of the records, if known
+    model_file: str | None = None  # the bags of the fit may be named by their place beside it
 
 
 @dataclass(frozen=True)
@@ -31,6 +40,11 @@ class VerifyOutcome:
     verification: Verification
     records: Sequence[Record]
     findings: Sequence[Findings]
+
+    @property
+    def independent(self) -> list[bool]:
+        """Whether the model was identified without each of the records."""
+        return [one.independent for one in next(iter(self.verification.axes.values())).records]
 
 
 def verify(request: VerifyRequest) -> VerifyOutcome:
@@ -45,8 +59,18 @@ def verify(request: VerifyRequest) -> VerifyOutcome:
     with mismatch_in_data():
         source = replace(source, axes=shared_axes(records, model, source))
         found = require_for_model(records, model, source)
+        require_followed(records, source, model)
         told = verification.verify(
             records, model, request.tolerance, axes=source.axes, desired=desired, without_offset=request.without_offset,
             start=source.start, stop=source.stop, start_memory=request.start_memory,
+            own=[] if source.records else _of_the_fit(source.bags, model, request.model_file),
         )  # fmt: skip
     return VerifyOutcome(told, records, found)
+
+
+def _of_the_fit(bags: Sequence[str], model: StageModel, model_file: str | None) -> list[str]:
+    """Return those of the bags that the model was identified from, by their paths."""
+    # Those of the calibrator are named by their place beside the model.
+    places = [Path(), *([] if model_file is None else [Path(model_file).parent])]
+    known = {(at / bag).resolve() for axis in model.axes.values() for bag in axis.quality.sources for at in places}
+    return [str(Path(bag)) for bag in bags if Path(bag).resolve() in known]

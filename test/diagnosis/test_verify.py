@@ -71,6 +71,25 @@ def test_whatever_went_before_an_unchanged_stage_passes(record, history, model):
     assert abs(one.constant) <= one.offset_uncertainty
 
 
+@pytest.mark.parametrize(
+    ("gain", "own", "verdict"),
+    [
+        ((1.0,), ("0",), "unproved"),
+        ((1.0, 1.0), ("0",), "passed"),
+        ((1.03, 1.0), ("0",), "failed"),
+        ((1.0, 1.03), ("0",), "failed"),
+        ((1.0, 1.0), ("0", "1"), "unproved"),
+        ((1.0, 1.03), ("0", "1"), "failed"),
+    ],
+)
+def test_a_record_of_the_fit_only_counts_if_it_fails(gain, own, verdict, model):
+    records = [replace(unseen(gain=each), source=str(k)) for k, each in enumerate(gain)]
+    found = slpi_ros.verify(records, model, own=own)
+    validate(found.to_document(), "verification", "test")
+    assert found.verdict == verdict and found.passed == (verdict == "passed")
+    assert all(one.verdict != "passed" for one in found.axes["x"].records if not one.independent)
+
+
 @pytest.mark.parametrize("offset", [-0.93e-6, 0.2e-6])
 def test_a_moved_zero_is_no_error_of_the_loops(offset, model):
     one = judged(unseen((100, 20, 80), offset=offset), model)

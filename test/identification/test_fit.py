@@ -139,7 +139,10 @@ BAD = {
     "displacement without variation": ({"y": lambda y: np.full_like(y, 1e-6)}, "displacement stays at 1e-06 m"),
     "no displacement": ({"y": lambda y: np.full_like(y, np.nan)}, "0 usable samples"),
     "infinite": ({"v": lambda v: np.full_like(v, np.inf)}, "0 usable samples"),
-    "time backwards": ({"t": lambda t: np.concatenate([t[:100], t[50:-50]])}, "time runs backwards at sample 100"),
+    "time backwards": (
+        {"t": lambda t: np.concatenate([t[:100], t[50:-50]])},
+        "stamps go back by 0.245 s at message 101",
+    ),
     "one sample": ({key: lambda x: x[:1] for key in "tvy"}, "1 usable samples"),
     "nothing": ({key: lambda x: x[:0] for key in "tvy"}, "0 usable samples"),
 }

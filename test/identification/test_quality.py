@@ -279,10 +279,28 @@ def test_what_is_no_record_of_a_driven_axis():
     t, v, y = measured(6)
     with pytest.raises(UsageError, match="no axis 'w'"):
         assess(record_of(t, v, y), "w")
-    with pytest.raises(RecordError, match="time runs backwards"):
+    with pytest.raises(RecordError, match=f"stamps go back by .* at message 2 of {t.size}"):
         quality(t[::-1], v, y)
+    with pytest.raises(RecordError, match=f"all {t.size} messages have one stamp"):
+        quality(np.zeros(t.size), v, y)
     with pytest.raises(RecordError, match="usable samples"):
         quality(t[:20], v[:20], y[:20])
+
+
+def test_infinite_readings_are_not_told_as_missing():
+    t, v, y = measured(6)
+    y[[500, 600, 700]] = np.inf, -np.inf, np.nan
+    told = [finding.text for finding in findings(quality(t, v, y))]
+    assert any(line.startswith("displacement infinite for 2 of") for line in told)
+    assert any(line.startswith("displacement missing (nan) for 1 of") for line in told)
+
+
+def test_a_clock_that_was_set_back_is_told_where_messages_were_sorted():
+    t, v, y = measured(6)
+    back = np.where(np.arange(t.size) < t.size // 2, t, t - 0.4 * t[-1])
+    order = np.argsort(back, kind="stable")
+    with pytest.raises(IdentificationError, match="with the stamp of the one before: two recordings in one"):
+        require_usable(findings(quality(np.round(back, 6)[order], v[order], y[order])), "bag")
 
 
 def test_only_the_part_to_be_fitted_counts():

@@ -22,7 +22,7 @@ from slpi_ros.io.bag_files import partial_path
 from slpi_ros.io.bag_reader import read_bag
 from slpi_ros.io.bag_writer import BagWriter, write_bag
 from slpi_ros.io.messages import JOINT_STATE, encode_joint_states
-from slpi_ros.io.record import Record
+from slpi_ros.io.record import OUT_OF_ORDER, Record
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 SUFFIX = {"mcap": ".mcap", "sqlite3": ".db3"}
@@ -105,6 +105,27 @@ def test_what_is_wrong_with_a_record_survives(tmp_path, storage):
     record.voltage["x"][1] = np.inf
     write_bag(tmp_path / "bag", record, storage=storage)
     assert_same(read_bag(tmp_path / "bag"), record)
+
+
+@pytest.mark.parametrize(("order", "told"), [("back", "1 of 100"), ("reversed", "99 of 100"), ("ascending", "")])
+def test_that_messages_were_sorted_is_told(order, told, tmp_path):
+    record = make_record(samples=100, axes=("x",))
+    rows, stamps = np.arange(100), record.time_ns
+    if order == "back":
+        rows, stamps = np.roll(rows, 50), stamps - stamps[0] + 10**18
+        stamps[50:] += 20 * 10**9
+    elif order == "reversed":
+        rows = rows[::-1]
+    columns = (record.displacement["x"][:, None], record.voltage["x"][:, None])
+    messages = encode_joint_states(stamps, *columns, ("x",), "stage")
+    with BagWriter(tmp_path / "bag") as bag:
+        for row in rows.tolist():
+            bag.write(int(stamps[row]), messages[row], "/stage_state")
+    read = read_bag(tmp_path / "bag")
+    np.testing.assert_array_equal(read.time_ns, stamps)
+    notes = [note for note in read.notes if note.startswith(OUT_OF_ORDER)]
+    assert [told in note for note in notes] == ([True] if told else [])
+    assert any("--stop" in note for note in notes) == (order == "back")
 
 
 @both_storages
@@ -368,7 +389,7 @@ import sys
 import numpy as np
 from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.errors import RecordError
-from slpi_ros.io.record import Record
+from slpi_ros.io.record import OUT_OF_ORDER, Record
 
 n = 30_000
 record = Record(time_ns=np.arange(n), voltage={"x": np.ones(n)}, displacement={"x": np.ones(n)})

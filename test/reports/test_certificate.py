@@ -12,12 +12,16 @@ from reports.pages import parsed
 
 import slpi_ros
 from slpi_ros.cli import main
+from slpi_ros.effects.surroundings import Quantity, Surroundings
+from slpi_ros.errors import length
 from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.schemas import validate
 from slpi_ros.model.axis_model import Start
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.model.uncertainty import COMPONENTS
+from slpi_ros.reports import certificate as certificates
 from slpi_ros.reports.uncertainty import PLACES, TIMES
+from slpi_ros.reports.verification import FILES, describe_verification
 
 NOISE = 8e-9
 BEGINS = datetime(2026, 5, 6, 7, 8, 9, tzinfo=UTC)
@@ -93,11 +97,59 @@ def test_a_record_of_the_model_proves_nothing(folder, verify):
     model = slpi_ros.load_model(folder / "model.json")
     own = replace(model.axes["x"], quality=replace(QUALITY, source="today"))
     slpi_ros.save_model(replace(model, axes={"x": own}), folder / "own.json")
-    verify("--model", "own.json", "--certificate", "-o", "own")
-    document = json.loads((folder / "own" / "certificate.json").read_text())
+    code, said, _ = verify("--model", "own.json", "--certificate", "-o", "own")
+    assert code == 1 and "unproved" in said.splitlines()[0] and said.splitlines()[-1].startswith("next: slpi verify")
+    document, judged = (json.loads((folder / "own" / name).read_text()) for name in ("certificate.json", FILES[0]))
     assert not document["records"][0]["independent"]
-    assert document["verdict"] == document["axes"]["x"]["verdict"] == "unproved"
+    for axis in (document["axes"]["x"], judged["axes"]["x"]):
+        assert {document["verdict"], axis["verdict"], *(one["verdict"] for one in axis.get("errors", []))} == {
+            "unproved"
+        }
+    (one,) = judged["axes"]["x"]["records"]
+    assert (one["verdict"], one["passed"], one["independent"]) == ("unproved", False, False)
     assert "proves nothing on today" in (folder / "own" / "certificate.html").read_text()
+
+
+@pytest.mark.parametrize(
+    ("options", "named", "code"),
+    [((), "without its constant part", 0), (("--tolerance", "0.05"), "absolute error", 1)],
+)
+def test_the_headline_names_the_error_that_is_judged(options, named, code, folder, verify):
+    record = slpi_ros.read_bag(folder / "today")
+    moved = replace(record, displacement={"x": record.displacement["x"] + 2e-6})
+    write_bag(folder / f"moved{code}", moved)
+    assert main(["verify", f"moved{code}", "--model", "model.json", *options, "--certificate", "-o", "moved"]) == code
+    (one,) = json.loads((folder / "moved" / "certificate.json").read_text())["axes"]["x"]["errors"]
+    head = parsed(folder / "moved" / "certificate.html").texts["verdict-stage"]
+    judged = length(one[one["limit_of"]])
+    assert named in head.split(" rms")[0] and f"{judged} rms" in head and f"limit {length(one['limit_m'])}" in head
+    assert ("no tolerance for it was given" in head) == (code == 0) and length(one["rms_m"]) in head
+
+
+@pytest.mark.parametrize("recorded", [True, False])
+def test_the_budget_takes_quantities_as_they_were_recorded(recorded, folder):
+    model = slpi_ros.load_model(folder / "model.json")
+    one = Quantity("/room", offset_gain=1e-7, reference=21.0, lowest=19.0, highest=23.0)
+    effect = Surroundings((one,), uncertainty={"quantities.0.offset_gain": 1e-9})
+    model = replace(model, axes={"x": replace(model.axes["x"], effects=(effect,))})
+    times = np.arange(16.0)
+    beside = {"/room" if recorded else "/hall": (times, 21.0 + 2.0 * times / 15.0)}
+    record = replace(slpi_ros.read_bag(folder / "today"), surroundings=beside)
+    found = slpi_ros.verify(record, model)
+    of = certificates.Verified(found, [record], [str(folder / "today")], model, str(folder / "model.json"))
+    document = certificates.certificate(of)
+    certificates.write_files(folder / "follows", document)
+    text = (folder / "follows" / "certificate.html").read_text()
+    budget, (kept,) = document["axes"]["x"]["uncertainty"], document["records"]
+    unknown = 1e-7 * 4.0 / 12.0**0.5
+    assert budget["unknown_quantities_m"] == pytest.approx(unknown)
+    assert budget["quantities"] == [{"name": "/room", "value": 22.0 if recorded else None}]
+    own = 1e-9 if recorded else unknown
+    assert [each["surroundings_m"] for each in budget["budget"]] == pytest.approx([own] * len(budget["budget"]))
+    assert kept["not_recorded"] == ([] if recorded else ["/room"])
+    assert ("/room, which the model follows, was not recorded" in text) != recorded
+    told = describe_verification(found)[0]
+    assert ("does not hold /room" in told and "/hall" in told) != recorded
 
 
 def test_a_model_of_an_earlier_version_has_a_certificate_without_a_budget(folder, verify):

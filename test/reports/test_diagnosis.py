@@ -21,7 +21,9 @@ from slpi_ros.diagnosis.result import (
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.hum import Hum, Line
 from slpi_ros.model.stage_model import StageModel
+from slpi_ros.reports import diagnosis as diagnosis_page
 from slpi_ros.reports.diagnosis import PAGE, page_of
+from slpi_ros.reports.page import Page
 
 CHARTS = ("time", "motion", "frequency", "loops")
 HOSTILE = "</script><img src=x onerror=alert(1)>"
@@ -151,6 +153,17 @@ def test_missing_readings(tmp_path):
     assert len(parsed(write(tmp_path, {"x": found(traces=gaps)})).charts) == len(CHARTS)
 
 
+def test_commands_are_code_and_values_are_no_python(tmp_path):
+    page = Page("page")
+    page.text("`slpi refit <b>` with this record")
+    page.table(("what",), [("see `slpi show`",)])
+    page.write(tmp_path / "page.html")
+    text = (tmp_path / "page.html").read_text()
+    assert "<code>slpi refit &lt;b&gt;</code> with" in text and "<code>slpi show</code>" in text
+    document = {"parameters": {"a": None, "b": [], "c": [1.0, 2.0]}, "uncertainty": {}}
+    assert diagnosis_page._parameters(document) == "a none; b none; c [1, 2]"
+
+
 def test_hostile_texts_stay_text(tmp_path):
     named = replace(found().effects[0], evidence=HOSTILE, alternatives=(HOSTILE,))
     loud = replace(traces(), contributions={HOSTILE: traces().contributions["creep"]})
@@ -186,6 +199,6 @@ def test_each_record_has_its_row(tmp_path):
         RecordOutcome("second bag", 40e-9, 180e-9, 11.5e-9, None),
     )
     text = write(tmp_path, {"x": found(records=records)}).read_text(encoding="utf-8")
-    cells = ["first bag", "-0.93", "210 nm", "12.5 nm", "17.5 nm", "second bag", "+0.04", "180 nm", "11.5 nm", "-"]
+    cells = ["first bag", "-930 nm", "210 nm", "12.5 nm", "17.5 nm", "second bag", "+40 nm", "180 nm", "11.5 nm", "-"]
     rows = [f"<tr>{''.join(f'<td>{cell}</td>' for cell in row)}</tr>" for row in (cells[:5], cells[5:])]
     assert "".join(rows) in text

@@ -1,6 +1,7 @@
 """``--with`` from end to end: identify, verify, refit, diagnose, fleet and the job of the identify node on bags."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -110,3 +111,38 @@ def test_only_the_named_ones_are_looked_at(bags, followed, tmp_path, capsys):
     assert said(capsys, "diagnose", bags[0], "--model", plain, "--with", DECOY, "-o", found)[0] == 0
     (axis,) = json.loads((found / "diagnosis.json").read_text())["axes"].values()
     assert axis["looked_at"] == [DECOY]
+
+
+@pytest.fixture(scope="module")
+def poor(tmp_path_factory):
+    """A bag with quantities that cannot be used: of two readings, of half the time, of another time, and constant."""
+    one = record(offset=GAIN)
+    t, values = one.surroundings[TOPIC]
+    half, constant = t.size // 2, np.full(t.size, 21.0)
+    courses = {
+        "/two": (t[[0, -1]], values[[0, -1]]), "/half": (t[:half], values[:half]), "/out": (t + 5000.0, values),
+        "/still": (t, constant), TOPIC: (t, values),
+    }  # fmt: skip
+    return written(tmp_path_factory.mktemp("poor") / "bag", replace(one, surroundings=courses))
+
+
+POOR = {"/two": "2 readings", "/half": "its readings go from", "/out": "its readings go from", "/still": "stays at 21"}
+
+
+@pytest.mark.parametrize("name", POOR)
+def test_a_named_quantity_that_cannot_be_used_is_told(name, poor, tmp_path, capsys):
+    command = "identify", poor, "-o", tmp_path / "model.json", "--with"
+    code, _, err = said(capsys, *command, name)
+    assert code == 1 and err.count("\n") == 1 and f"{name} is not used" in err and POOR[name] in err
+    code, _, err = said(capsys, *command, name, TOPIC)
+    assert code == 0 and f"{name} is not used: " in err and POOR[name] in err
+    assert gain_of(tmp_path / "model.json") == pytest.approx(GAIN, rel=0.1)
+
+
+def test_a_verification_tells_what_the_model_does_not_follow(poor, followed, tmp_path, capsys):
+    for command in (("verify", poor, "--model", followed), ("refit", followed, poor, "-o", tmp_path / "new.json")):
+        code, _, err = said(capsys, *command, "--with", "/two")
+        assert code == 1 and err.count("\n") == 1 and holds(err, "/two is not used", TOPIC)
+        code, _, err = said(capsys, *command, "--with", "/two", TOPIC)
+        assert code == 0 and "/two is not used: the model does not follow it" in err
+        assert said(capsys, *command)[2] == ""

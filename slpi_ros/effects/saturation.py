@@ -7,13 +7,15 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from slpi_ros.arrays import FloatArray, Mask
+from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.effects.base import EffectBase, EffectContext, FitContext, ResidualContext, Side, Signal
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter, require
 
 # Number of voltage bins; a bin is clipped if its gain is below this share of the median gain.
 BINS, STILL = 200, 0.35
+# Distance from a limit, as a share of the range, within which a voltage is at it.
+WITHIN = 1e-6
 
 
 def _limit(default: float) -> Any:
@@ -70,10 +72,12 @@ class Saturation(EffectBase):
         # At the piezo: what the hysteresis feels moves on while the voltage rests.
         v = context.u if context.around.voltage is None else context.around.voltage
         low, width = float(v.min()), float(np.ptp(v)) / BINS
-        middle, dv, dy = outward_steps(v, context.y, context.used)
+        first, last = outward_steps(v, context.used)
+        dv, dy, middle = v[last] - v[first], context.y[last] - context.y[first], 0.5 * (v[last] + v[first])
         place = np.clip(((middle - low) / width).astype(np.int64), 0, BINS - 1)
-        moved = np.bincount(place, dv**2, BINS)
-        gain = np.bincount(place, dv * dy, BINS) / np.maximum(moved, 1e-300)
+        # A few steps in a bin are noisy: each with its neighbours.
+        moved, way = (np.convolve(np.bincount(place, x, BINS), np.ones(3), "same") for x in (dv**2, dv * dy))
+        gain = way / np.maximum(moved, 1e-300)
         still = (gain < STILL * np.median(gain[moved > 0])) | (moved == 0)
         at_top, at_bottom = int(np.argmin(still[::-1])), int(np.argmin(still))
         upper = low + (BINS - at_top) * width if at_top else np.inf
@@ -84,10 +88,13 @@ class Saturation(EffectBase):
 
     def plausible(self, context: FitContext) -> bool:
         """Return whether the stage stands still while the voltage changes beyond the limits."""
-        middle, dv, dy = outward_steps(context.v, context.y, context.used)
-        inside = (middle > self.lower) & (middle < self.upper)
+        first, last = outward_steps(context.v, context.used)
+        dv, dy = context.v[last] - context.v[first], context.y[last] - context.y[first]
+        # By what reaches the piezo, which may follow the voltage late.
+        middle, within = 0.5 * (context.u[last] + context.u[first]), WITHIN * float(np.ptp(context.v))
+        inside = (middle > self.lower + within) & (middle < self.upper - within)
         usual = float(dv[inside] @ dy[inside] / max(float(dv[inside] @ dv[inside]), 1e-300))
-        for beyond in (middle >= self.upper, middle <= self.lower):
+        for beyond in (middle >= self.upper - within, middle <= self.lower + within):
             if beyond.any() and float(dv[beyond] @ dy[beyond]) > STILL * usual * float(dv[beyond] @ dv[beyond]):
                 return False
         return True
@@ -104,13 +111,13 @@ class Saturation(EffectBase):
         return f"the amplifier clips {' and '.join(where) or 'nowhere'}"
 
 
-def outward_steps(v: FloatArray, y: FloatArray, used: Mask) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Return mean voltage (V), its change and displacement (m), (M,), of steps away from the middle of the range."""
+def outward_steps(v: FloatArray, used: Mask) -> tuple[IntArray, IntArray]:
+    """Return the first and last samples, (M,), of steps of a voltage (V, (N,)) away from the middle of its range."""
     # Beyond a clipping limit they give no displacement.
     low, high = float(v.min()), float(v.max())
     # Steps over several samples improve the signal-to-noise ratio.
     every = max(1, round((high - low) / BINS / 4 / max(float(np.mean(np.abs(np.diff(v)))), 1e-12)))
-    middle, dv, dy = 0.5 * (v[every:] + v[:-every]), v[every:] - v[:-every], y[every:] - y[:-every]
+    middle, dv = 0.5 * (v[every:] + v[:-every]), v[every:] - v[:-every]
     outward = (dv > 0) == (middle > 0.5 * (low + high))
-    chosen = used[every:] & used[:-every] & outward & (dv != 0.0)
-    return middle[chosen], dv[chosen], dy[chosen]
+    first = np.flatnonzero(used[every:] & used[:-every] & outward & (dv != 0.0))
+    return first, first + every

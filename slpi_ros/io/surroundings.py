@@ -28,7 +28,7 @@ MOST = 64
 # than `MOST_READINGS` the means of equal numbers are taken.
 FEWEST_READINGS, NOISY, MOST_READINGS = 12, 2e-3, 700
 # Time constants of running means, in intervals of the readings; largest number of readings that they are chosen by.
-AVERAGINGS, MOST_AVERAGED = np.array([1.0, 2.0, 4.0, 8.0, 16.0, 32.0]), 5000
+AVERAGINGS, MOST_AVERAGED = np.array([0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0]), 100_000
 # What smoothing takes away is noise if its rms is at most this multiple of that.
 IS_NOISE = 1.3
 # Ratio of the median magnitude of second differences of white noise to its standard deviation.

@@ -191,11 +191,11 @@ def _diagnose_axis(
     begun = {effect.name for effect in made.beginnings[:1]}
     named = {one.name for one in made.selection.named}
     imitates = not named or any(EFFECTS[name].free_course for name in named)
-    if begun and imitates and _leaves_more(made.selection, ABOVE_NOISE) and not one_speed(evidence):
+    if begun and imitates and not _explains_all(made.selection) and not one_speed(evidence):
         # What does not hold, or has a free course, may have been in the way of the causes: these count if they explain
         # all.
         again = attempt(begun)
-        if again.selection.named and not _leaves_more(again.selection, ABOVE_NOISE):
+        if again.selection.named and _explains_all(again.selection):
             made = again
     selection, given, extension = made.selection, made.given, made.extension
     # A hysteresis as smooth as beside the effects that were tried takes up less of what is left.
@@ -285,6 +285,11 @@ def _is_unsure(named: Named, dropped: Collection[str] = ()) -> bool:
 def _leaves_more(selection: Selection, multiple: float) -> bool:
     """Return whether more than a multiple of the repeatability is left."""
     return selection.now.held_out.rms_of_records > multiple * _repeatability(selection.now).rms
+
+
+def _explains_all(selection: Selection) -> bool:
+    """Return whether no more is left than the sensor's noise."""
+    return selection.now.held_out.rms_of_records <= ABOVE_NOISE * selection.now.noise
 
 
 def _of_another_kind(selection: Selection) -> bool:

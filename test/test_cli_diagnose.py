@@ -228,7 +228,7 @@ def another_axis(record):
 
 
 def backwards(record):
-    return replace(record, time_ns=record.time_ns[::-1].copy()), "sample 1"
+    return replace(record, time_ns=record.time_ns[::-1].copy()), "message 2"
 
 
 RECORDS = (

@@ -230,9 +230,10 @@ def _require_order(record: Record) -> None:
     stamps, at = record.time_ns, first_step_back(record.time_ns)
     if at is not None:
         before, then = ((int(stamps[k]) - int(stamps[0])) * 1e-9 for k in (at - 1, at))
+        part = f"use the part before it (--stop {before:.6g}), or record again" if at >= FEWEST else "record again"
         raise RecordError(
             f"{record.source}: stamps go back by {before - then:.4g} s at message {at + 1} of {len(record)}, from "
-            f"{before:.6g} to {then:.6g} s: use the part before it (--stop {before:.6g}), or record again"
+            f"{before:.6g} to {then:.6g} s: {part}"
         )
     if len(record) >= FEWEST and stamps[0] == stamps[-1]:
         raise RecordError(

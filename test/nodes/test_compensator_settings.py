@@ -16,7 +16,7 @@ from slpi_ros.model.limits import Limits  # noqa: E402
 from slpi_ros.nodes.compensator_parameters import DECLARATIONS, CompensatorSettings  # noqa: E402
 
 CONFIG = Path(__file__).resolve().parents[2] / "config"
-COMPENSATORS = sorted(path for path in CONFIG.glob("*.yaml") if path.stem != "exciter")
+COMPENSATORS = sorted(path for path in CONFIG.glob("*.yaml") if path.stem not in ("exciter", "simulated_device"))
 DEFAULTS = {entry.name: entry.default for entry in DECLARATIONS}
 
 

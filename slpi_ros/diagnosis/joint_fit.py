@@ -320,7 +320,7 @@ def _groups(problem: Problem, evidence: Evidence) -> list[IntArray]:
     judged, groups = _judged(problem), []
     for rows in evidence.slices:
         fitted = evidence.rows[rows][problem.weights[evidence.rows[rows]] > 0]
-        fitted = fitted[:: -(-problem.count // MOST_ROWS)]
+        fitted = _thinned(fitted, -(-problem.count // MOST_ROWS))
         settled = int(fitted[int(BEGINNING * fitted.size)]) if fitted.size else 0
         allowed = np.zeros(problem.y.size, dtype=bool)
         allowed[fitted] = judged[fitted]
@@ -328,6 +328,13 @@ def _groups(problem: Problem, evidence: Evidence) -> list[IntArray]:
         always = np.setdiff1d(fitted, np.concatenate(folds), assume_unique=True)
         groups += [always, *folds]
     return groups
+
+
+def _thinned(rows: IntArray, every: int) -> IntArray:
+    """Return one of every so many rows, shape (n,), at irregular distances, so that no line becomes another one."""
+    first = np.arange(0, rows.size, every)
+    taken: IntArray = rows[np.minimum(first + np.random.default_rng(0).integers(0, every, first.size), rows.size - 1)]
+    return taken
 
 
 def _judged(problem: Problem) -> Mask:

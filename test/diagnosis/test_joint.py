@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from slpi_ros.diagnosis.joint_fit import Joint
+from slpi_ros.diagnosis.joint_fit import Joint, _thinned
 from slpi_ros.diagnosis.prepare import Evidence, Part
 from slpi_ros.identification.bases import SurfaceBasis
 
@@ -115,3 +115,11 @@ def test_precision_is_what_many_noises_show():
     gains = np.array([beside.fit(said.y + noise * rng.normal(size=said.y.size))[1] for _ in range(300)])
     stated = noise * np.sqrt(np.diag(np.linalg.inv(beside.precision)))
     np.testing.assert_allclose(gains.std(axis=0), stated, rtol=0.15)
+
+
+def test_thinned_rows_show_a_line_at_a_quarter_of_the_sampling_rate():
+    t = _thinned(np.arange(40_000), 2) / 200.0
+    assert t.size == 20_000 and np.all(np.diff(t) > 0.0)
+    # Both parts of the line are seen, and one is not mistaken for the other.
+    parts = np.column_stack([np.sin(2 * np.pi * 50.0 * t), np.cos(2 * np.pi * 50.0 * t)])
+    assert np.linalg.cond(parts) < 1.1

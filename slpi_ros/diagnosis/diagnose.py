@@ -412,7 +412,8 @@ def _given(model: AxisModel, runs: Sequence[FreeRun], selection: Selection) -> G
     if model.kind in REFITTED and not own.any():
         span = max(motion, float(np.ptp(model.displacement_range)))
         require_own(best.hysteresis_rms, best.refitted_rms, span)
-    best = replace(best, explained=_fits_anew(model, selection, own, best.hysteresis_rms))
+    if best.changed:
+        best = replace(best, explained=_fits_anew(model, selection, own, best.hysteresis_rms))
     zero = max((run.moved for run in runs), key=abs)
     moved = abs(zero) > ZERO * max(rms, CHANGED * motion)
     return replace(best, zero_moved=zero if moved else None)

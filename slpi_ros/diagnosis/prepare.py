@@ -13,10 +13,9 @@ from slpi_ros.errors import RecordError
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.bases import Basis, SurfaceBasis
-from slpi_ros.identification.design_matrix import Walk
 from slpi_ros.identification.drive import Runs
 from slpi_ros.identification.free_run import choose_start
-from slpi_ros.identification.least_squares import Problem, solve_free
+from slpi_ros.identification.least_squares import Problem, solve_free, walk_of
 from slpi_ros.identification.linear_kinds import SELECTION_SAMPLES, SMOOTHNESS
 from slpi_ros.identification.published_kinds import voltage_dead_band
 from slpi_ros.identification.refit import basis_of
@@ -190,8 +189,7 @@ class Evidence:
 
     def predict(self, samples: Sequence[Samples], x: FloatArray) -> FloatArray:
         """Return the displacement of the hysteresis at samples, shape (N,), for parameters `x`, in their unit."""
-        walks = [Walk.along(own.v, symmetric_rest=self.basis.symmetric_rest, primed=own.primed) for own in samples]
-        walk, size = Walk.joined(walks), self.basis.size
+        walk, size = walk_of(samples, self.basis), self.basis.size
         increments = self.basis.increments(walk, x[:size])
         # The displacement at rest of each record.
         rest = walk.origin < 0
@@ -273,21 +271,19 @@ def _readings(
 
 def no_cause(course: Course, begins: float, ends: float) -> str:
     """Return why a recorded quantity can be no cause of what is between two times (s); "" if it can."""
-    _, value = clean(course)
-    if reason := few(course) or uncovered(course, begins, ends):
+    at, value = clean(course)
+    if reason := few(at) or uncovered(at, begins, ends):
         return reason
     return f"it stays at {value[0]:.4g}" if np.ptp(value) == 0.0 else ""
 
 
-def few(course: Course) -> str:
-    """Return how many readings a quantity has, and how many are needed; "" if it has enough."""
-    at, _ = clean(course)
+def few(at: FloatArray) -> str:
+    """Return how many readings there are, at times `at` (s, (n,)), and how many are needed; "" if enough."""
     return "" if at.size >= FEWEST_READINGS else f"{at.size} readings, at least {FEWEST_READINGS} are needed"
 
 
-def uncovered(course: Course, begins: float, ends: float) -> str:
-    """Return which time the readings of a quantity cover; "" if it is most of that between two times (s)."""
-    at, _ = clean(course)
+def uncovered(at: FloatArray, begins: float, ends: float) -> str:
+    """Return which time readings at times `at` (s, (n,)) cover; "" if it is most of that between two times (s)."""
     if at.size and min(at[-1], ends) - max(at[0], begins) >= ENOUGH_TIME * (ends - begins):
         return ""
     covers = f"its readings go from {at[0]:.4g} to {at[-1]:.4g} s" if at.size else "it has no reading"
@@ -298,7 +294,8 @@ def _at_stamps(record: Record, t: FloatArray) -> dict[str, FloatArray]:
     """Return the quantities of a record at times `t`, shape (N,), s, that were recorded over most of that."""
     found = {}
     for key, course in record.surroundings.items():
-        if not (few(course) or uncovered(course, float(t[0]), float(t[-1]))):
+        at, _ = clean(course)
+        if not (few(at) or uncovered(at, float(t[0]), float(t[-1]))):
             found[key] = np.interp(t, *smoothed(course))
     return found
 

@@ -193,7 +193,7 @@ class Given:
     zero_moved: float | None  # m, largest among the records; None: small, or due to the initial state
     motion: float  # m, range of the measured displacement
     own_rms: float  # at the identification of the model, if these are its records, else 0
-    explained: bool  # whether a new fit leaves little
+    explained: bool  # whether a new fit leaves little, where the stage seems to have changed
 
     @property
     def changed(self) -> bool:

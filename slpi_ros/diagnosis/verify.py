@@ -6,9 +6,9 @@ judged to which it only adds a constant, or all if these are too few.
 """
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from scipy.ndimage import maximum_filter1d, minimum_filter1d
@@ -162,6 +162,18 @@ class RecordVerification:
         }
 
 
+Judged = TypeVar("Judged")
+
+
+def counted(records: Sequence[Judged], facts: Iterable[tuple[bool, str]]) -> Sequence[Judged]:
+    """Return the records that decide about a verdict; `facts` tell of each whether it is independent, and its verdict.
+
+    Independent ones and those that fail; all, if there is none of these.
+    """
+    pairs = zip(records, facts, strict=True)
+    return [one for one, (independent, verdict) in pairs if independent or verdict == FAILED] or records
+
+
 @dataclass(frozen=True)
 class AxisVerification:
     """Verification of one axis on all records."""
@@ -185,7 +197,7 @@ class AxisVerification:
     @property
     def counted(self) -> tuple[RecordVerification, ...]:
         """The records that decide about the verdict."""
-        return tuple(one for one in self.records if one.independent or one.verdict == FAILED) or self.records
+        return tuple(counted(self.records, [(one.independent, one.verdict) for one in self.records]))
 
     @property
     def passed(self) -> bool:

@@ -1,5 +1,6 @@
 """Bases of the models that are linear in their parameters: branch increments, roughness, monotonicity constraints."""
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -234,7 +235,7 @@ class SurfaceBasis:
         return float(np.count_nonzero(touched < pairs) / pairs)
 
 
-class OperatorWeights:
+class OperatorWeights(ABC):
     """Base class of bases with one weight for each operator; `thresholds` (V) has shape (size,)."""
 
     thresholds: FloatArray
@@ -254,9 +255,9 @@ class OperatorWeights:
         along: FloatArray = self.branch_part(walk) @ x
         return along
 
+    @abstractmethod
     def branch_part(self, walk: Walk) -> sp.csr_array:
         """Return the motion of each operator along the branch of each sample, shape (N, size)."""
-        raise NotImplementedError
 
     def monotone(self, gain: float) -> tuple[sp.csr_array, FloatArray]:
         """Return the constraints of non-negative weights and a positive weight at the lowest threshold."""

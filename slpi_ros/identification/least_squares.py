@@ -92,6 +92,13 @@ REWEIGHTINGS = 3
 RIDGE = 1e-9
 
 
+def walk_of(samples: Sequence[Samples], basis: Basis) -> Walk:
+    """Return the hysteresis branches of the samples of one record or several."""
+    return Walk.joined(
+        [Walk.along(part.v, symmetric_rest=basis.symmetric_rest, primed=part.primed) for part in samples]
+    )
+
+
 @dataclass(frozen=True)
 class Problem:
     """Least-squares problem of the fit of one basis to one or several records."""
@@ -108,9 +115,7 @@ class Problem:
     @classmethod
     def pose(cls, samples: Sequence[Samples], basis: Basis) -> "Problem":
         """Pose the problem of fitting `basis` to the samples of one record or several."""
-        walk = Walk.joined(
-            [Walk.along(part.v, symmetric_rest=basis.symmetric_rest, primed=part.primed) for part in samples]
-        )
+        walk = walk_of(samples, basis)
         design = Design.of(walk, basis.branch_part(walk))
         volts, metres = np.max([part.spread for part in samples], axis=0).tolist()
         rough = np.zeros((design.local.shape[1],) * 2)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from slpi_ros.diagnosis.verify import FAILED, RecordVerification, Verification
+from slpi_ros.diagnosis.verify import RecordVerification, Verification, counted
 from slpi_ros.errors import SlpiError, length
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.io.digests import digests
@@ -121,9 +121,13 @@ def write_files(folder: Path, document: dict[str, Any]) -> None:
 def _verdict(document: dict[str, Any]) -> str:
     own = [record["source"] for record in document["records"] if not record["independent"]]
     dependent = f" It proves nothing on {', '.join(own)}, from which the model was identified." if own else ""
-    counted = [one for axis in document["axes"].values() for one in _counted(axis, own)]
-    worst = max(counted, key=lambda one: one[one["limit_of"]] / one["limit_m"] if one["limit_m"] else np.inf)
-    several = {"axis": len(document["axes"]), "record": len({one["source"] for one in counted})}
+    deciding = [
+        one
+        for axis in document["axes"].values()
+        for one in counted(axis["errors"], [(each["source"] not in own, each["verdict"]) for each in axis["errors"]])
+    ]
+    worst = max(deciding, key=lambda one: one[one["limit_of"]] / one["limit_m"] if one["limit_m"] else np.inf)
+    several = {"axis": len(document["axes"]), "record": len({one["source"] for one in deciding})}
     among = [what for what, count in several.items() if count > 1]
     where = f" on the worst {' and '.join(among)}" if among else ""
     limit = f"{where} (limit {length(worst['limit_m'])})"
@@ -132,14 +136,8 @@ def _verdict(document: dict[str, Any]) -> str:
     why = "the tolerance is not for it" if document["tolerance_m"] else "no tolerance for it was given"
     return (
         f"The error of the model without its constant part is {length(worst['rest_rms_m'])} rms{limit}; the absolute "
-        f"error is {length(max(one['rms_m'] for one in counted))}: {why}.{dependent}"
+        f"error is {length(max(one['rms_m'] for one in deciding))}: {why}.{dependent}"
     )
-
-
-def _counted(axis: dict[str, Any], own: Sequence[str]) -> list[dict[str, Any]]:
-    """Return the errors on the records that decide about the verdict of an axis, as in `AxisVerification.counted`."""
-    errors: list[dict[str, Any]] = axis["errors"]
-    return [one for one in errors if one["source"] not in own or one["verdict"] == FAILED] or errors
 
 
 def _show_axis(page: Page, name: str, axis: dict[str, Any]) -> None:

@@ -152,10 +152,8 @@ def describe_verification(found: Verification, *, details: bool = True) -> list[
 def _summary(name: str, axis: AxisVerification) -> str:
     """Return a sentence with the error and its limit, and the remedy for an axis that does not pass."""
     several = f" on the worst of {len(axis.counted)} records" if len(axis.counted) > 1 else ""
-    said = f"Axis {name}: {_error(axis.worst)}{several}."
     lacking = next((record for record in axis.records if record.lacking), None)
-    if lacking:
-        said = f"Axis {name}: {_lacking(lacking)} {said.removeprefix(f'Axis {name}: ')}"
+    said = f"Axis {name}: {f'{_lacking(lacking)} ' if lacking else ''}{_error(axis.worst)}{several}."
     if axis.passed:
         moved = [record for record in axis.records if record.zero_moved]
         return said + (f" The zero has moved by {_um(moved[0].offset)} µm; the loops are the same." if moved else "")

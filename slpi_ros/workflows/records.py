@@ -11,7 +11,7 @@ from slpi_ros.identification.record_quality import Finding, assess, findings, re
 from slpi_ros.io.alignment import SeparateTopics
 from slpi_ros.io.bag_reader import read_bag, require_different, require_one_stage
 from slpi_ros.io.record import OUT_OF_ORDER, Course, Record, first_step_back
-from slpi_ros.io.surroundings import named_in
+from slpi_ros.io.surroundings import clean, named_in
 from slpi_ros.model.sensor import IDEAL, Sensor, corrected
 from slpi_ros.model.stage_model import StageModel
 
@@ -61,8 +61,10 @@ class Source:
 
     def _ordered(self, record: Record) -> Record:
         """Return a record without what comes after stamps that go back, where `stop` leaves it out anyway."""
-        at = None if self.stop is None else first_step_back(record.time_ns)
-        if at is None or self.stop is None or (int(record.time_ns[at - 1]) - int(record.time_ns[0])) * 1e-9 < self.stop:
+        if self.stop is None:
+            return record
+        at = first_step_back(record.time_ns)
+        if at is None or (int(record.time_ns[at - 1]) - int(record.time_ns[0])) * 1e-9 < self.stop:
             return record
         return record.part(slice(at))
 
@@ -97,7 +99,7 @@ def require_followed(records: Sequence[Record], source: Source, model: StageMode
     _require_named(records, source, why)
     for record in records if source.surroundings and not source.records else ():
         for key, course in record.surroundings.items():
-            if key in model.quantities and (gap := uncovered(course, *_span(record, source))):
+            if key in model.quantities and (gap := uncovered(clean(course)[0], *_span(record, source))):
                 warnings.warn(f"{record.source}: {key}: {gap}; beyond them the nearest one is taken", stacklevel=2)
 
 

@@ -108,6 +108,11 @@ def served(name, delay, folder):
         process.join()
 
 
+def others_time():
+    """Return the time of the processor (s) used by the other threads of this process: the driver, not what commands."""
+    return time.process_time() - time.thread_time()
+
+
 def driven(name, address, rate, seconds):
     """Return the row of the driver, commanded once a cycle by another thread."""
     kind, axes, gain, _ = DEVICES[name]
@@ -119,14 +124,14 @@ def driven(name, address, rate, seconds):
     while loop.counts.cycles < 100:
         time.sleep(0.01)
     loop.timing.restart()
-    before, late, used, begun = loop.counts.cycles, loop.counts.late, time.process_time(), time.perf_counter()
+    before, late, used, begun = loop.counts.cycles, loop.counts.late, others_time(), time.perf_counter()
     sent = 0
     while (t := time.perf_counter() - begun) < seconds:
         loop.command([45.0 + 40.0 * math.sin(6.0 * t)] * len(axes))
         # Steadily, as a compensator does: the cycles fall in step with the commands.
         sent = max(sent + 1, int(t * rate))
         time.sleep(max(begun + sent / rate - time.perf_counter(), 0.0))
-    cycles, late, used = loop.counts.cycles - before, loop.counts.late - late, time.process_time() - used
+    cycles, late, used = loop.counts.cycles - before, loop.counts.late - late, others_time() - used
     report = loop.timing.report()
     loop.end()
     thread.join()

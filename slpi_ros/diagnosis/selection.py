@@ -114,6 +114,11 @@ def select(base: Explanation, family: Explanation | None, not_first: Collection[
     return best
 
 
+def resumed(selection: Selection, family: Explanation | None) -> Selection:
+    """Return a selection that goes on from one whose joint fits have changed; `family` as in `select`."""
+    return _grown(selection.base, family, resume=selection)
+
+
 def _beginning(now: Explanation, effect: Effect) -> Explanation:
     """Return the fit with an effect that is known from an earlier selection."""
     return with_companion(now, effect).adding(effect).refined(STEPS)
@@ -124,8 +129,12 @@ def _grown(
     family: Explanation | None,
     beginnings: tuple[Effect, ...] = (),
     not_first: Collection[str] = (),
+    resume: Selection | None = None,
 ) -> Selection:
-    """Add effects as long as one has a significant gain, at first that of `beginnings`; remove needless ones."""
+    """Add effects as long as one has a significant gain, at first that of `beginnings`; remove needless ones.
+
+    With `resume`, go on from that selection.
+    """
     structures: tuple[str, ...]
     now, structures = (family, (BIAS,)) if family else (base, ())
     start = now
@@ -133,6 +142,10 @@ def _grown(
     rivals: dict[str, list[Effect]] = {}
     dropped: set[str] = set()
     exchanged, rounds, trials = False, 0, 1.0
+    if resume:
+        now, structures, trials, dropped = resume.now, resume.structures, resume.trials, set(resume.dropped)
+        rivals = {name: list(others) for name, others in resume.rivals.items()}
+        beginnings = resume.beginnings if rivals else ()
     finest = max(FINEST * float(np.ptp(now.y[now.used])), ROUNDING_LEFT * now.evidence.rounding)
     while len(rivals) < MOST_EFFECTS and rounds < MOST_ROUNDS and now.held_out.rms > finest:
         rounds += 1

@@ -114,9 +114,23 @@ def select(base: Explanation, family: Explanation | None, not_first: Collection[
     return best
 
 
-def resumed(selection: Selection, family: Explanation | None) -> Selection:
-    """Return a selection that goes on from one whose joint fits have changed; `family` as in `select`."""
-    return _grown(selection.base, family, resume=selection)
+def settled(selection: Selection, start: Explanation, now: Explanation) -> Selection:
+    """Return a selection with another joint fit `now` of the same effects, and `start` without them.
+
+    Which of them are needed, and in which form, is decided anew.
+    """
+    rivals = {name: list(others) for name, others in selection.rivals.items()}
+    step = usual_step(now.t)
+    for name in selection.rivals:
+        for rival in selection.rivals[name]:
+            simple = rival.simpler(step)
+            if simple is not None and simple.name == name and rival.name not in rivals:
+                now = now.replacing(name, rival).refined(CONVERGED)
+                rivals[rival.name] = [one for one in rivals.pop(name) if one.name != rival.name]
+                break
+    now, named = _ended(start, now, rivals)
+    kept = {one.name: rivals[one.name] for one in named}
+    return replace(selection, now=now, named=named, rivals=kept)
 
 
 def _beginning(now: Explanation, effect: Effect) -> Explanation:
@@ -129,12 +143,8 @@ def _grown(
     family: Explanation | None,
     beginnings: tuple[Effect, ...] = (),
     not_first: Collection[str] = (),
-    resume: Selection | None = None,
 ) -> Selection:
-    """Add effects as long as one has a significant gain, at first that of `beginnings`; remove needless ones.
-
-    With `resume`, go on from that selection.
-    """
+    """Add effects as long as one has a significant gain, at first that of `beginnings`; remove needless ones."""
     structures: tuple[str, ...]
     now, structures = (family, (BIAS,)) if family else (base, ())
     start = now
@@ -142,10 +152,6 @@ def _grown(
     rivals: dict[str, list[Effect]] = {}
     dropped: set[str] = set()
     exchanged, rounds, trials = False, 0, 1.0
-    if resume:
-        now, structures, trials, dropped = resume.now, resume.structures, resume.trials, set(resume.dropped)
-        rivals = {name: list(others) for name, others in resume.rivals.items()}
-        beginnings = resume.beginnings if rivals else ()
     finest = max(FINEST * float(np.ptp(now.y[now.used])), ROUNDING_LEFT * now.evidence.rounding)
     while len(rivals) < MOST_EFFECTS and rounds < MOST_ROUNDS and now.held_out.rms > finest:
         rounds += 1
@@ -187,12 +193,19 @@ def _grown(
     # Exchanged effects and removed structures may have made other effects unnecessary.
     with_structures, now = now, now.bare()
     now = _without_needless(now, set(rivals), restart=now is not with_structures)
-    # At their best parameters together, some may no longer be necessary.
-    now = _without_needless(_plainer(now.refined(CONVERGED), rivals), set(rivals), restart=False)
-    named = _named(start, now, rivals)
+    now, named = _ended(start, now, rivals)
     dropped -= {one.name for one in named}
     kept = {one.name: rivals[one.name] for one in named}
     return Selection(base, now, named, structures, tuple(sorted(dropped)), trials, beginnings, kept)
+
+
+def _ended(
+    start: Explanation, now: Explanation, rivals: dict[str, list[Effect]]
+) -> tuple[Explanation, tuple[Named, ...]]:
+    """Return the fit with the effects at their best parameters together, and what it names."""
+    # There, some may no longer be necessary.
+    now = _without_needless(_plainer(now.refined(CONVERGED), rivals), set(rivals), restart=False)
+    return now, _named(start, now, rivals)
 
 
 def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:

@@ -15,7 +15,7 @@ from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged, signals_of
-from slpi_ros.diagnosis.selection import CONVERGED, Named, Selection, select
+from slpi_ros.diagnosis.selection import CONVERGED, Named, Selection, select, settled
 from slpi_ros.diagnosis.significance import counts, worse_on_none
 from slpi_ros.diagnosis.structures import BIAS
 from slpi_ros.effects.base import Effect, EffectContext
@@ -351,6 +351,12 @@ def _selected(base: Explanation, of_family: Evidence | None, not_first: Collecti
         if selection.now.held_out.rms <= COARSER * now.held_out.rms:
             as_good = now.held_out.rms <= COARSER * selection.now.held_out.rms
             return replace(selection, base=base, now=now) if as_good else selection
+        if now.held_out.rms <= ABOVE_NOISE * now.noise:
+            # What the coarser one left was its own doing.
+            start = Explanation(finest, base.effects) if BIAS in selection.structures else base
+            selection = settled(replace(selection, base=base), start, now)
+            if _explains_all(selection):
+                return selection
     return _of_kind(base, of_family, not_first)
 
 
@@ -533,7 +539,7 @@ def _extended(model: AxisModel, now: Explanation, source: str) -> AxisModel:
         voltage_range=(float(voltage.min()), float(voltage.max())),
         displacement_range=(float(y.min()), float(y.max())),
         effects=tuple(
-            effect.started(now.began[effect.name], len(evidence.parts)).averaged(evidence.averagings)
+            effect.started(now.began[effect.name], len(evidence.parts)).with_filters(evidence.courses)
             for effect in now.with_uncertainty()
             if not isinstance(effect, EachRecord)
         ),

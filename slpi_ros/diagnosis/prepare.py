@@ -22,7 +22,7 @@ from slpi_ros.identification.refit import basis_of
 from slpi_ros.identification.samples import Samples, select_samples
 from slpi_ros.identification.signal_statistics import digit
 from slpi_ros.io.record import Course, Record
-from slpi_ros.io.surroundings import averaging, clean, smoothed
+from slpi_ros.io.surroundings import clean, smoothed
 from slpi_ros.model.axis_model import AxisModel
 
 # Smallest numbers of samples and of reversals that allow a cross-validation.
@@ -72,7 +72,7 @@ class Part:
     others: Mapping[str, FloatArray]  # m, of the other axes from the start of the record
     digit: float  # m, resolution of the readings, 0: continuous
     surroundings: Mapping[str, FloatArray] = field(default_factory=dict)  # recorded quantities, in their units
-    averagings: Mapping[str, float] = field(default_factory=dict)  # s, of the running means of noisy quantities
+    courses: Mapping[str, Course] = field(default_factory=dict)  # their readings
     mixed: float = 0.0  # share of readings, not used, that are early, late or a mixture of two
 
 
@@ -131,9 +131,9 @@ class Evidence:
         }
 
     @property
-    def averagings(self) -> Mapping[str, float]:
-        """Time constants (s) of the running means of quantities, the shortest of the records."""
-        return {key: min(part.averagings.get(key, 0.0) for part in self.parts) for key in self.surroundings}
+    def courses(self) -> Mapping[str, Sequence[Course]]:
+        """Readings of the quantities that all records contain, of each record."""
+        return {key: [part.courses[key] for part in self.parts] for key in self.surroundings}
 
     @cached_property
     def slices(self) -> tuple[slice, ...]:
@@ -237,7 +237,7 @@ def evidence_of(
             others=others,
             digit=digit(samples.y[samples.fitted]),
             surroundings=(beside := _at_stamps(record, t)),
-            averagings={key: averaging(record.surroundings[key]) for key in beside},
+            courses={key: record.surroundings[key] for key in beside},
         )
         for record, (t, samples, others), beginning in zip(records, read, beginnings, strict=True)
     )

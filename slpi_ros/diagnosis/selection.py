@@ -114,6 +114,25 @@ def select(base: Explanation, family: Explanation | None, not_first: Collection[
     return best
 
 
+def settled(selection: Selection, start: Explanation, now: Explanation) -> Selection:
+    """Return a selection with another joint fit `now` of the same effects, and `start` without them.
+
+    Which of them are needed, and in which form, is decided anew.
+    """
+    rivals = {name: list(others) for name, others in selection.rivals.items()}
+    step = usual_step(now.t)
+    for name in selection.rivals:
+        for rival in selection.rivals[name]:
+            simple = rival.simpler(step)
+            if simple is not None and simple.name == name and rival.name not in rivals:
+                now = now.replacing(name, rival).refined(CONVERGED)
+                rivals[rival.name] = [one for one in rivals.pop(name) if one.name != rival.name]
+                break
+    now, named = _ended(start, now, rivals)
+    kept = {one.name: rivals[one.name] for one in named}
+    return replace(selection, now=now, named=named, rivals=kept)
+
+
 def _beginning(now: Explanation, effect: Effect) -> Explanation:
     """Return the fit with an effect that is known from an earlier selection."""
     return with_companion(now, effect).adding(effect).refined(STEPS)
@@ -174,12 +193,19 @@ def _grown(
     # Exchanged effects and removed structures may have made other effects unnecessary.
     with_structures, now = now, now.bare()
     now = _without_needless(now, set(rivals), restart=now is not with_structures)
-    # At their best parameters together, some may no longer be necessary.
-    now = _without_needless(_plainer(now.refined(CONVERGED), rivals), set(rivals), restart=False)
-    named = _named(start, now, rivals)
+    now, named = _ended(start, now, rivals)
     dropped -= {one.name for one in named}
     kept = {one.name: rivals[one.name] for one in named}
     return Selection(base, now, named, structures, tuple(sorted(dropped)), trials, beginnings, kept)
+
+
+def _ended(
+    start: Explanation, now: Explanation, rivals: dict[str, list[Effect]]
+) -> tuple[Explanation, tuple[Named, ...]]:
+    """Return the fit with the effects at their best parameters together, and what it names."""
+    # There, some may no longer be necessary.
+    now = _without_needless(_plainer(now.refined(CONVERGED), rivals), set(rivals), restart=False)
+    return now, _named(start, now, rivals)
 
 
 def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:

@@ -15,6 +15,7 @@ from slpi_ros.effects.excitation import Excitation
 from slpi_ros.effects.filters import Uniform
 from slpi_ros.effects.parameters import Leaf, facts_of, leaves, require_facts, with_leaves
 from slpi_ros.hysteresis.turning_points import Memory
+from slpi_ros.io.record import Course
 
 # The voltage, the hysteresis itself (between the voltage that it feels and its displacement), or the displacement.
 Signal = Literal["voltage", "hysteresis", "displacement"]
@@ -418,8 +419,8 @@ class EffectBase(Protocol):
         """Names of the recorded quantities that it follows."""
         return tuple(one.key for one in self.followed)
 
-    def averaged(self, seconds: Mapping[str, float]) -> Self:
-        """Return the effect with the time constants (s) of the means of its quantities, by name, that are taken."""
+    def with_filters(self, courses: Mapping[str, Sequence[Course]]) -> Self:
+        """Return the effect with filters for readings like these, the courses of its quantities in each record."""
         return self
 
     def only(self, keys: Sequence[str]) -> "Effect | None":

@@ -26,12 +26,16 @@ from slpi_ros.effects.base import (
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining, safe_duration
 from slpi_ros.effects.filters import filtered, hold
 from slpi_ros.effects.parameters import Fit, Leaf, parameter, require, text
+from slpi_ros.effects.readings import ReadingsFilter, best_filter, line_after
 from slpi_ros.errors import length
+from slpi_ros.io.record import Course
 
 # Largest number of quantities.
 MOST = 4
 # Number of time constants of the candidates; the shortest (s), and the longest as a share of the longest record.
 TIME_CONSTANTS, SHORTEST, LONGEST = 6, 1.0, 0.5
+# Times (s) by which the stage precedes the readings, of the candidates.
+LEADS = (1.5, 6.0)
 # Largest plausible change of the sensitivity.
 LARGEST = 0.3
 # Time constants, as shares of a record, of the drifts beside which a quantity has to prove itself.
@@ -61,8 +65,15 @@ class Quantity:
         "s", "time constant with which the stage follows, 0: at once", 0, 1e7, default=0.0,
         fit=Fit("relative", least=0.1 * SHORTEST, within_record=True, absent=True),
     )  # fmt: skip
+    lead: float = parameter(
+        "s", "time by which the stage precedes the readings, of a sensor that is slower", 0, 1e7, default=0.0,
+        fit=Fit("relative", least=0.1 * SHORTEST, within_record=True, absent=True),
+    )  # fmt: skip
     averaging: float = parameter(
-        "s", "time constant of the mean of the readings that is taken in use, 0: none", 0, 1e7, default=0.0
+        "s", "time constant of the filter of the readings in use, 0: none", 0, 1e7, default=0.0
+    )
+    ahead: float = parameter(
+        "s", "time by which their running line is continued in use, 0: their mean is taken", 0, 1e7, default=0.0
     )
     # Range of the recorded values.
     lowest: float = parameter("", "lowest recorded value, in its unit", -1e30, 1e30, default=0.0)
@@ -78,7 +89,7 @@ class Quantity:
         value = around.surroundings.get(self.key)
         if value is None:
             return np.zeros_like(around.t)
-        return _lagged(value - self.reference, self.time_constant, around)
+        return _lagged(_advanced(value - self.reference, self.lead, around), self.time_constant, around)
 
 
 @dataclass(frozen=True)
@@ -204,11 +215,9 @@ class Surroundings(EffectBase):
         """Return the effect with what is left of before its records."""
         return replace(self, initial=tuple(amplitudes.tolist()))
 
-    def averaged(self, seconds: Mapping[str, float]) -> "Surroundings":
-        """Return the effect with the time constants (s), by quantity, of the means that are taken in use."""
-        return replace(
-            self, quantities=tuple(replace(one, averaging=seconds.get(one.key, 0.0)) for one in self.quantities)
-        )
+    def with_filters(self, courses: Mapping[str, Sequence[Course]]) -> "Surroundings":
+        """Return the effect with filters for readings like these, the courses of each quantity in each record."""
+        return replace(self, quantities=tuple(_with_filter(one, courses.get(one.key, ())) for one in self.quantities))
 
     @property
     def _lags(self) -> tuple[float, ...]:
@@ -234,8 +243,8 @@ class Surroundings(EffectBase):
                 continue
             topic, _, own = key.partition(":")
             found = Quantity(topic, own, float(inside.mean()), lowest=lowest, highest=highest)
-            for tau in (0.0, *lags):
-                one = replace(found, time_constant=tau)
+            for tau, lead in ((0.0, 0.0), *((tau, 0.0) for tau in lags), *((0.0, lead) for lead in LEADS)):
+                one = replace(found, time_constant=tau, lead=lead)
                 follows = one.followed(around)
                 size = float(np.abs(follows).max())
                 if not size > 0.0:
@@ -299,15 +308,16 @@ class Surroundings(EffectBase):
 class StreamingSurroundings(StreamingBase):
     """Streaming (sample by sample) surroundings: each quantity holds its last value, at first the reference.
 
-    Of noisy readings it is their running mean.
+    Of noisy or late readings it is what their filter gives.
     """
 
     def __init__(self, effect: Surroundings) -> None:
         self._quantities, self._origin = effect.quantities, effect.origin
         self._places = {one.key: place for place, one in enumerate(effect.quantities)}
         self._values: list[float | None] = [None] * len(effect.quantities)
-        # Mean and state of the lag of each quantity, by deviation from the reference.
-        self._states = [(0.0, 0.0)] * len(effect.quantities)
+        # Of each quantity, by deviation from the reference: what the filter gives, state of the lag, and value and
+        # slope (1/s) of the running line.
+        self._states = [(0.0, 0.0, 0.0, 0.0)] * len(effect.quantities)
 
     def surround(self, key: str, value: float) -> None:
         """Note the value of a quantity for the next sample; one that it does not follow, or not finite, is ignored."""
@@ -317,7 +327,7 @@ class StreamingSurroundings(StreamingBase):
         if self._values[place] is None:
             # The first value that is known: the stage has followed it before.
             moved = value - self._quantities[place].reference
-            self._states[place] = moved, moved
+            self._states[place] = moved, moved, moved, 0.0
         self._values[place] = value
 
     def forward(self, dt: float, x: float) -> float:
@@ -339,36 +349,53 @@ class StreamingSurroundings(StreamingBase):
                 self.surround(key, value)
 
     def snapshot(self) -> tuple[tuple[tuple[float, ...], ...], ...]:
-        """Return known value, input and state of each quantity, without the first one where it is not known."""
+        """Return known value and states of each quantity, without the first one where it is not known."""
         pairs = zip(self._values, self._states, strict=True)
         return (tuple((*state,) if value is None else (value, *state) for value, state in pairs),)
 
     def restore(self, state: Any) -> None:
         """Replace the state by one returned by `snapshot`."""
         for place, one in enumerate(state[0]):
-            self._values[place] = one[0] if len(one) == 3 else None
-            self._states[place] = one[-2], one[-1]
+            self._values[place] = one[0] if len(one) == 5 else None
+            self._states[place] = one[-4], one[-3], one[-2], one[-1]
 
-    def _after(self, dt: float) -> list[tuple[float, float]]:
+    def _after(self, dt: float) -> list[tuple[float, float, float, float]]:
         states = []
-        for one, value, (before, state) in zip(self._quantities, self._values, self._states, strict=True):
+        for one, value, (before, state, level, slope) in zip(self._quantities, self._values, self._states, strict=True):
             moved = before if value is None else value - one.reference
-            if one.averaging:
+            if one.ahead and one.averaging:
+                level, slope = line_after(dt, one.averaging, moved, level, slope)
+                moved = level + one.ahead * slope
+            elif one.averaging:
                 moved -= exp(-dt / one.averaging) * (moved - before)
             if one.time_constant:
                 step = hold(dt, one.time_constant)
                 state = step.now * moved + step.before * before + step.kept * state
             else:
                 state = moved
-            states.append((moved, state))
+            states.append((moved, state, level, slope))
         return states
 
-    def _parts(self, states: Sequence[tuple[float, float]]) -> tuple[float, float]:
+    def _parts(self, states: Sequence[tuple[float, float, float, float]]) -> tuple[float, float]:
         factor, offset = 1.0, 0.0
-        for one, (_, follows) in zip(self._quantities, states, strict=True):
+        for one, (_, follows, _, _) in zip(self._quantities, states, strict=True):
             factor += one.sensitivity_gain * follows
             offset += one.offset_gain * follows
         return factor, offset
+
+
+def _with_filter(one: Quantity, courses: Sequence[Course]) -> Quantity:
+    """Return a quantity with the filter of its readings that takes the least time, of those that suit the records."""
+    found = min((best_filter(course, one.lead) for course in courses), default=ReadingsFilter())
+    return replace(one, averaging=found.time_constant, ahead=found.ahead)
+
+
+def _advanced(value: FloatArray, lead: float, around: EffectContext) -> FloatArray:
+    """Return a quantity a time (s) later, shape (N,); at the end of each record it stays."""
+    if not lead:
+        return value
+    pairs = zip(around.split(value), around.split(around.t), strict=True)
+    return np.concatenate([np.interp(t + lead, t, own) for own, t in pairs])
 
 
 def _lagged(value: FloatArray, time_constant: float, around: EffectContext) -> FloatArray:
@@ -405,6 +432,7 @@ def _described(one: Quantity) -> str:
     if one.sensitivity_gain:
         said.append(f"the sensitivity by {100 * one.sensitivity_gain:.3g} %")
     late = f", with a time constant of {one.time_constant:.3g} s" if one.time_constant else ""
+    late += f", {one.lead:.3g} s before its readings" if one.lead else ""
     return (
         f"for each unit of {one.key} {' and '.join(said) or 'nothing changes'}{late} (recorded from {one.lowest:.4g} "
         f"to {one.highest:.4g})"

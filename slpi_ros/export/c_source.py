@@ -226,7 +226,7 @@ class _Tables:
         followed = effect.quantities if effect else ()
         rows = []
         for one in followed:
-            values = (one.reference, one.offset_gain, one.sensitivity_gain, one.time_constant, one.averaging)
+            values = (one.reference, one.offset_gain, one.sensitivity_gain, one.time_constant, one.averaging, one.ahead)
             rows.append(f"    {{{self._quantities[one.key]}, {', '.join(map(number, values))}}},")
         if rows:
             name = f"{self._prefix}_quantity"

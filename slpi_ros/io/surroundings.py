@@ -27,8 +27,6 @@ MOST = 64
 # Readings are smoothed from this number on, and as far as their white noise exceeds this share of their range; of more
 # than `MOST_READINGS` the means of equal numbers are taken.
 FEWEST_READINGS, NOISY, MOST_READINGS = 12, 2e-3, 700
-# Time constants of running means, in intervals of the readings; largest number of readings that they are chosen by.
-AVERAGINGS, MOST_AVERAGED = np.array([0.5, 1.0, 2.0, 4.0, 8.0, 16.0, 32.0]), 100_000
 # What smoothing takes away is noise if its rms is at most this multiple of that.
 IS_NOISE = 1.3
 # Ratio of the median magnitude of second differences of white noise to its standard deviation.
@@ -142,29 +140,6 @@ def smoothed(course: Course) -> Course:
     Between its readings it is linear, and beyond them as it is there.
     """
     return _smoothed(*clean(course))
-
-
-def averaging(course: Course) -> float:
-    """Return the time constant (s) of the running mean of readings that is nearest to the quantity; 0: none.
-
-    A running mean (first-order lag) takes away noise, and is late: it is compared with `smoothed`.
-    """
-    t, value = clean(course)
-    t, value = t[:MOST_AVERAGED], value[:MOST_AVERAGED]
-    if t.size < FEWEST_READINGS:
-        return 0.0
-    true = np.interp(t, *_smoothed(t, value))
-    best, least = 0.0, float(np.mean((value - true) ** 2))
-    if not least > 0.0:
-        return 0.0
-    for tau in (float(np.median(np.diff(t))) * AVERAGINGS).tolist():
-        kept, mean, error = np.exp(-np.diff(t, prepend=t[0]) / tau).tolist(), float(true[0]), 0.0
-        for share, reading, wanted in zip(kept, value.tolist(), true.tolist(), strict=True):
-            mean = reading + share * (mean - reading)
-            error += (mean - wanted) ** 2
-        if error / t.size < least:
-            best, least = tau, error / t.size
-    return best
 
 
 def _smoothed(t: FloatArray, value: FloatArray) -> Course:

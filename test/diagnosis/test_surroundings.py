@@ -118,6 +118,19 @@ def test_sensitivity_and_time_constant(facts, late):
 
 
 @pytest.mark.long
+def test_a_sensor_slower_than_the_stage_is_made_up_for_in_use():
+    beside = {TOPIC: read_by(RoomSensor(4.0, lag=6.0, noise=0.02, seed=1), temperature)}
+    _, diagnosis = diagnosed(record(offset=3e-7, beside=beside))
+    (one,) = quantities(diagnosis.axes["x"])
+    assert one.offset_gain == pytest.approx(3e-7, rel=0.1) and one.time_constant == 0.0
+    # The simulated sensor takes each value as it was for the whole interval before it.
+    kept = np.exp(-4.0 / 6.0)
+    assert one.lead == pytest.approx(4.0 * kept / (1.0 - kept), abs=1.0)
+    (used,) = (each for effect in diagnosis.extended.axes["x"].effects for each in effect.quantities)
+    assert used.lead == one.lead and used.ahead == pytest.approx(one.lead + 2.0, abs=0.2)
+
+
+@pytest.mark.long
 def test_two_quantities_that_go_together_are_ambiguous():
     given = record(offset=2e-7)
     both = given.surroundings | {"/rack/temperature": given.surroundings[TOPIC]}

@@ -46,8 +46,8 @@ EVERY: tuple[Effect, ...] = (
     SelfHeating(1e-8, 3.0, 1e-6),
     Surroundings(
         (
-            Quantity("/room/temperature", "", 20.0, 3e-8, 1e-3, 0.5, 0.02, lowest=18.0, highest=24.0),
-            Quantity("/load", "force.z", 0.0, -2e-8, 0.0, 0.0, 0.0, lowest=0.0, highest=5.0),
+            Quantity("/room/temperature", "", 20.0, 3e-8, 1e-3, 0.5, averaging=0.02, lowest=18.0, highest=24.0),
+            Quantity("/load", "force.z", 0.0, -2e-8, 0.0, 0.0, averaging=0.05, ahead=0.02, lowest=0.0, highest=5.0),
         ),
         1e-6,
     ),

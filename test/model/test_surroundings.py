@@ -149,3 +149,22 @@ def test_noisy_readings_are_averaged_in_use():
     stream = model_of(SETS[0]).stream("x")
     before = stream.step(0.0, 5e-6, {"/room/temperature": 22.0})
     assert stream.step(0.1, 5e-6, {"/room/temperature": np.nan, "/other": 5.0}) == before
+
+
+def test_a_quantity_that_the_stage_precedes_is_foretold_in_use():
+    # The readings are 60 ms late, and the stage follows what will be read.
+    one = replace(WARM, sensitivity_gain=0.0, lead=0.06)
+    y, late = np.full(T.size, float(np.mean(path()))), np.interp(T - 0.06, T, ROOM["/room/temperature"])
+    model = model_of([Surroundings((replace(one, averaging=0.01, ahead=0.06),))])
+    truth = model_of([Surroundings((replace(WARM, sensitivity_gain=0.0),))])
+    wanted = truth.compensate(T, y, surroundings={"/room/temperature": ROOM["/room/temperature"]})[100:]
+    foretold = followed(model.stream("x"), y, {"/room/temperature": late})[100:]
+    held = followed(model_of([Surroundings((one,))]).stream("x"), y, {"/room/temperature": late})[100:]
+    assert np.std(foretold - wanted) < 0.15 * np.std(held - wanted)
+    # Of a record all of the readings are known.
+    v = model.compensate(T, y)[:-100]
+    np.testing.assert_allclose(
+        model.simulate(T[:-100], v, {"/room/temperature": late[:-100]})[:-100],
+        truth.simulate(T[:-100], v, {"/room/temperature": ROOM["/room/temperature"][:-100]})[:-100],
+        rtol=0, atol=2e-9,
+    )  # fmt: skip

@@ -278,8 +278,10 @@ def _without_unsure(selection: Selection) -> Selection:
 
 def _is_unsure(named: Named, dropped: Collection[str] = ()) -> bool:
     effect = EFFECTS[named.name]
+    # That two forms of a shift in time are alike makes neither unsure.
+    shifts = {name for name, one in EFFECTS.items() if one.time_shift == effect.time_shift == "only"}
     # What is left of a drift that was dropped looks like creep.
-    return effect.free_course or bool(named.alternatives) or effect.resembles_when_old in dropped
+    return effect.free_course or bool({*named.alternatives} - shifts) or effect.resembles_when_old in dropped
 
 
 def _leaves_more(selection: Selection, multiple: float) -> bool:
@@ -341,18 +343,18 @@ def _not_as_judged(after: Sequence[FreeRun], runs: Sequence[FreeRun], selection:
 def _selected(base: Explanation, of_family: Evidence | None, not_first: Collection[str]) -> Selection:
     """Return the selection of effects, made with a coarser hysteresis if that is as good, and the joint fit without."""
     evidence, coarse = base.evidence, base.evidence.coarse
-    quick = Explanation(coarse, base.effects) if coarse is not evidence else None
-    if quick and quick.held_out.rms <= COARSER * base.held_out.rms:
+    if coarse is not evidence:
+        quick = Explanation(coarse, base.effects)
         selection = _of_kind(quick, of_family.coarse if of_family else None, not_first)
         finest = of_family if of_family and BIAS in selection.structures else evidence
         # A smoothness that suits few vertices may leave many without any hold.
         finer = replace(selection.now.evidence, basis=finest.basis, smoothness=evidence.smoothness)
         now = Explanation(finer, selection.now.effects).smoothed().refined(REFINED)
-        if selection.now.held_out.rms <= COARSER * now.held_out.rms:
+        if all(few.held_out.rms <= COARSER * many.held_out.rms for few, many in ((quick, base), (selection.now, now))):
             as_good = now.held_out.rms <= COARSER * selection.now.held_out.rms
             return replace(selection, base=base, now=now) if as_good else selection
-        if now.held_out.rms <= ABOVE_NOISE * now.noise:
-            # What the coarser one left was its own doing.
+        if selection.named and now.held_out.rms <= ABOVE_NOISE * now.noise:
+            # What few vertices left was their own doing, and many may follow what is no hysteresis.
             start = Explanation(finest, base.effects) if BIAS in selection.structures else base
             selection = settled(replace(selection, base=base), start, now)
             if _explains_all(selection):

@@ -39,10 +39,10 @@ REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
 # Effects that leave more than noise are part of the model if they leave at most this share of the error (a third of its
 # mean square), and if the free run of the extended model shows this share of the held-out gain.
 LEFT_OF_ERROR, GAIN_SHOWN = 0.6, 0.5
-# A drift, which may have any course, or a cause with alternatives may stand for a wrong hysteresis: where more than
-# noise is left, that is at most this share of what is left without it (a tenth of the mean square). At a single drive
-# frequency such a cause only gives the loops another shape, and none that leaves more than this multiple of the
-# repeatability is in the model.
+# A drift, which may have any course, a recorded quantity, one of several that go up and down, or a cause with
+# alternatives may stand for a wrong hysteresis or for a drift: where more than noise is left, that is at most this
+# share of what is left without it (a tenth of the mean square). At a single drive frequency such a cause only gives the
+# loops another shape, and none that leaves more than this multiple of the repeatability is in the model.
 LEFT_BY_UNSURE, MUCH_LEFT = 0.316, 3.0
 # Gauss-Newton steps of the selected effects with the hysteresis of the given model, which has more vertices; largest
 # ratio, either way, of the errors of the coarser one and with it that are as good.
@@ -281,7 +281,8 @@ def _is_unsure(named: Named, dropped: Collection[str] = ()) -> bool:
     # That two forms of a shift in time are alike makes neither unsure.
     shifts = {name for name, one in EFFECTS.items() if one.time_shift == effect.time_shift == "only"}
     # What is left of a drift that was dropped looks like creep.
-    return effect.free_course or bool({*named.alternatives} - shifts) or effect.resembles_when_old in dropped
+    anything = effect.free_course or effect.follows_quantities
+    return anything or bool({*named.alternatives} - shifts) or effect.resembles_when_old in dropped
 
 
 def _leaves_more(selection: Selection, multiple: float) -> bool:

@@ -204,10 +204,10 @@ def _grown(
     now, named = _ended(start, now, rivals)
     dropped -= {one.name for one in named}
     kept = {one.name: rivals[one.name] for one in named}
-    found = Selection(base, now, named, structures, tuple(sorted(dropped)), trials, beginnings, kept)
+    selection = Selection(base, now, named, structures, tuple(sorted(dropped)), trials, beginnings, kept)
     # Beside what has replaced another effect, more may be seen.
     replaced = named and now.held_out.rms < (1.0 - LEAST_GAIN) * before
-    return _grown(base, family, onward=found) if replaced and not onward else found
+    return _grown(base, family, onward=selection) if replaced and not onward else selection
 
 
 def _ended(

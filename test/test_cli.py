@@ -262,12 +262,16 @@ def test_a_temperature_beyond_the_record_is_told(folder, tmp_path):
     axis = replace(model.axes["x"], effects=(Surroundings((warm,)),))
     slpi_ros.save_model(replace(model, axes={"x": axis}), tmp_path / "warm.json")
     t, (low, high) = np.arange(200) / 100, axis.displacement_range
-    for name, end, told in (("inside", 22.5, ""), ("beyond", 40.0, "goes from 21 to 40, in the record of the model")):
+    beyond = "goes from 21 to 23.7, in the record of the model"
+    for name, end, told in (("inside", 22.5, ""), ("beyond", 23.7, beyond), ("kelvin", 294.0, "unit")):
         rows = np.column_stack([t, low + (high - low) * np.linspace(0.4, 0.5, t.size), np.linspace(21.0, end, t.size)])
         lines = ["time_s,x_m,/room/temperature", *(",".join(map(repr, row)) for row in rows.tolist())]
         (tmp_path / f"{name}.csv").write_text("\n".join(lines))
         done = slpi("compensate", tmp_path / "warm.json", tmp_path / f"{name}.csv", "-o", tmp_path / f"{name}_v.csv")
-        assert done.returncode == 0 and told in done.stderr and bool(done.stderr) == bool(told)
+        # What the compensator would not use is refused.
+        assert done.returncode == (2 if name == "kelvin" else 0), done.stderr
+        assert told in done.stderr and bool(done.stderr) == bool(told)
+        assert (tmp_path / f"{name}_v.csv").exists() == (name != "kelvin")
     done = slpi("compensate", tmp_path / "warm.json", folder / "desired.csv", "-o", tmp_path / "v.csv")
     assert "/room/temperature is not known and taken as 21" in done.stderr
 

@@ -35,6 +35,8 @@ def test_a_device_is_read_and_a_yaml_is_printed(name):
     (low,), (high,) = values["voltage_min"], values["voltage_max"]
     at = 20.0 / kind.gain
     assert low <= at <= high and high - low <= 10.0
+    # An amplifier of 20 V/V behind it moves the stage by no more than a tenth of its range.
+    assert (high - low) * kind.gain <= (10.0 if kind.gain == 1.0 else 20.0)
     assert f"{at:.4f} V" in done.stdout
 
 

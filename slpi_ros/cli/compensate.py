@@ -52,6 +52,7 @@ def _run(options: Namespace) -> Result:
     options.remarks += allow_table(options.output, table_header(known, "V"), overwrite=options.overwrite)
     if options.slew_limit < 0.0 or math.isnan(options.slew_limit):
         raise UsageError(f"--slew-limit {options.slew_limit:g}: give a positive number of V/s, or 0 for no limit")
+    common.require_usable(model, surroundings, options.table)
     options.remarks += common.quantities_beyond(model, t, surroundings)
     limits = Limits(options.voltage_min, options.voltage_max, options.slew_limit or math.inf)
     try:

@@ -155,6 +155,22 @@ def quantities_beyond(model: "StageModel", t: "FloatArray", surroundings: "Mappi
     return [one for one in dict.fromkeys(told) if one]
 
 
+def require_usable(model: "StageModel", surroundings: "Mapping[str, FloatArray]", table: str) -> None:
+    """Raise UsageError for values of a quantity that the compensator would not use: another unit, a broken sensor."""
+    import numpy as np
+
+    from slpi_ros.compensator.surroundings import Surrounding
+
+    for axis in model.axes.values():
+        for one in axis.followed:
+            values, (low, high) = surroundings.get(one.key), Surrounding(one).accepted
+            if values is not None and low < high and not (np.min(values) >= low and np.max(values) <= high):
+                raise UsageError(
+                    f"{table}: {one.key} goes from {np.min(values):.5g} to {np.max(values):.5g}, far outside of what "
+                    f"was recorded ({low:.5g} to {high:.5g} are taken); is its unit that of the record?"
+                )
+
+
 def source_of(options: Namespace) -> "Source":
     """Return bags, topics, axes and part of the records that the options select."""
     topic = _topics_of(options) if "voltage_topic" in options else options.topic

@@ -39,10 +39,10 @@ REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
 # Effects that leave more than noise are part of the model if they leave at most this share of the error (a third of its
 # mean square), and if the free run of the extended model shows this share of the held-out gain.
 LEFT_OF_ERROR, GAIN_SHOWN = 0.6, 0.5
-# A drift, which may have any course, or a cause with alternatives may stand for a wrong hysteresis: where more than
-# noise is left, that is at most this share of what is left without it (a tenth of the mean square). At a single drive
-# frequency such a cause only gives the loops another shape, and none that leaves more than this multiple of the
-# repeatability is in the model.
+# A drift, which may have any course, a recorded quantity, one of several that go up and down, or a cause with
+# alternatives may stand for a wrong hysteresis or for a drift: where more than noise is left, that is at most this
+# share of what is left without it (a tenth of the mean square). At a single drive frequency such a cause only gives the
+# loops another shape, and none that leaves more than this multiple of the repeatability is in the model.
 LEFT_BY_UNSURE, MUCH_LEFT = 0.316, 3.0
 # Gauss-Newton steps of the selected effects with the hysteresis of the given model, which has more vertices; largest
 # ratio, either way, of the errors of the coarser one and with it that are as good.
@@ -278,8 +278,11 @@ def _without_unsure(selection: Selection) -> Selection:
 
 def _is_unsure(named: Named, dropped: Collection[str] = ()) -> bool:
     effect = EFFECTS[named.name]
+    # That two forms of a shift in time are alike makes neither unsure.
+    shifts = {name for name, one in EFFECTS.items() if one.time_shift == effect.time_shift == "only"}
     # What is left of a drift that was dropped looks like creep.
-    return effect.free_course or bool(named.alternatives) or effect.resembles_when_old in dropped
+    anything = effect.free_course or effect.follows_quantities
+    return anything or bool({*named.alternatives} - shifts) or effect.resembles_when_old in dropped
 
 
 def _leaves_more(selection: Selection, multiple: float) -> bool:
@@ -341,18 +344,18 @@ def _not_as_judged(after: Sequence[FreeRun], runs: Sequence[FreeRun], selection:
 def _selected(base: Explanation, of_family: Evidence | None, not_first: Collection[str]) -> Selection:
     """Return the selection of effects, made with a coarser hysteresis if that is as good, and the joint fit without."""
     evidence, coarse = base.evidence, base.evidence.coarse
-    quick = Explanation(coarse, base.effects) if coarse is not evidence else None
-    if quick and quick.held_out.rms <= COARSER * base.held_out.rms:
+    if coarse is not evidence:
+        quick = Explanation(coarse, base.effects)
         selection = _of_kind(quick, of_family.coarse if of_family else None, not_first)
         finest = of_family if of_family and BIAS in selection.structures else evidence
         # A smoothness that suits few vertices may leave many without any hold.
         finer = replace(selection.now.evidence, basis=finest.basis, smoothness=evidence.smoothness)
         now = Explanation(finer, selection.now.effects).smoothed().refined(REFINED)
-        if selection.now.held_out.rms <= COARSER * now.held_out.rms:
+        if all(few.held_out.rms <= COARSER * many.held_out.rms for few, many in ((quick, base), (selection.now, now))):
             as_good = now.held_out.rms <= COARSER * selection.now.held_out.rms
             return replace(selection, base=base, now=now) if as_good else selection
-        if now.held_out.rms <= ABOVE_NOISE * now.noise:
-            # What the coarser one left was its own doing.
+        if selection.named and now.held_out.rms <= ABOVE_NOISE * now.noise:
+            # What few vertices left was their own doing, and many may follow what is no hysteresis.
             start = Explanation(finest, base.effects) if BIAS in selection.structures else base
             selection = settled(replace(selection, base=base), start, now)
             if _explains_all(selection):

@@ -32,8 +32,8 @@ ROUGHNESS = 1e-5
 LEAST_SHARE = 0.05
 # Largest number of spectral lines and of jumps; power of a line relative to the median of its surroundings.
 MOST_LINES, MOST_JUMPS, LINE = 6, 8, 30.0
-# Lines of this share of the largest amplitude are told.
-TALL = 0.1
+# Lines of this share of the largest amplitude are told; fewest periods of one in its record.
+TALL, PERIODS = 0.1, 10.0
 # Largest number of samples of a record, evenly thinned, for functions of a variable.
 ENOUGH = 40_000
 
@@ -294,7 +294,8 @@ def _lines(record: Signals) -> list[float]:
         near = slice(max(k - wide, 0), k + wide)
         # A harmonic of the drive is no line of its own: what goes with it repeats with the motion.
         driven = drive[k] > 1e-6 * drive[wide:].max() and drive[k] >= 0.5 * drive[near].max()
-        if not driven:
+        # Of a few periods nobody can say that they are one line: that is a drift.
+        if not driven and frequency[k] * (t[-1] - t[0]) >= PERIODS:
             found.append(_refined(t, record.residual, float(frequency[k]), 1.0 / (4 * grid.size * step)))
         rest[near] = 0.0
     return found

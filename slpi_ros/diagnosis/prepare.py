@@ -1,5 +1,6 @@
 """Preparation of the data of one axis for the joint fit."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -33,6 +34,9 @@ VERTICES = 41
 COARSE = 31
 # A quantity is looked at if it has this many readings, and they span this share of the time.
 FEWEST_READINGS, ENOUGH_TIME = 8, 0.7
+# It is one of the stage itself if at least so many changes from reading to reading have this correlation with those of
+# displacement or voltage.
+FEWEST_CHANGES, GOES_WITH = 20, 0.7
 # Samples before the reset of the hysteresis state may be excluded if at least this share of the samples remains.
 ENOUGH_WIPED = 0.5
 # They are excluded if their error exceeds that of the others by this factor, because the motion before the record is
@@ -269,12 +273,28 @@ def _readings(
     return t[chosen], samples, {name: y[chosen] for name, y in others.items()}
 
 
-def no_cause(course: Course, begins: float, ends: float) -> str:
+def no_cause(record: Record, course: Course, begins: float, ends: float) -> str:
     """Return why a recorded quantity can be no cause of what is between two times (s); "" if it can."""
     at, value = clean(course)
     if reason := few(at) or uncovered(at, begins, ends):
         return reason
-    return f"it stays at {value[0]:.4g}" if np.ptp(value) == 0.0 else ""
+    return f"it stays at {value[0]:.4g}" if np.ptp(value) == 0.0 else of_stage(record, (at, value))
+
+
+def of_stage(record: Record, course: Course) -> str:
+    """Return which signal of the stage itself a quantity goes with, from reading to reading; "" if with none."""
+    # A stage that followed a second sensor of itself would be in a feedback loop.
+    at, value = course
+    changes = np.diff(value)
+    if changes.size < FEWEST_CHANGES or not float(np.std(changes)) > 0.0:
+        return ""
+    for what, signals in (("displacement", record.displacement), ("voltage", record.voltage)):
+        for axis, signal in signals.items():
+            known = np.isfinite(signal)
+            own = np.diff(np.interp(at, record.t[known], signal[known])) if known.any() else np.zeros(0)
+            if own.size and float(np.std(own)) > 0.0 and (r := abs(float(np.corrcoef(changes, own)[0, 1]))) > GOES_WITH:
+                return f"it goes with the {what} of axis '{axis}' (correlation of the changes {r:.2f}): it is no cause"
+    return ""
 
 
 def few(at: FloatArray) -> str:
@@ -294,9 +314,13 @@ def _at_stamps(record: Record, t: FloatArray) -> dict[str, FloatArray]:
     """Return the quantities of a record at times `t`, shape (N,), s, that were recorded over most of that."""
     found = {}
     for key, course in record.surroundings.items():
-        at, _ = clean(course)
-        if not (few(at) or uncovered(at, float(t[0]), float(t[-1]))):
-            found[key] = np.interp(t, *smoothed(course))
+        at, value = clean(course)
+        if few(at) or uncovered(at, float(t[0]), float(t[-1])):
+            continue
+        if reason := of_stage(record, (at, value)):
+            warnings.warn(f"{record.source}: {key} is not used: {reason}", stacklevel=2)
+            continue
+        found[key] = np.interp(t, *smoothed(course))
     return found
 
 

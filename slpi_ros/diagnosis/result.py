@@ -251,7 +251,8 @@ def judged(
 
 
 def _named_effects(selection: Selection) -> tuple[NamedEffect, ...]:
-    fitted = {effect.name: effect for effect in selection.now.with_uncertainty()}
+    courses = selection.now.evidence.courses
+    fitted = {effect.name: effect.with_filters(courses) for effect in selection.now.with_uncertainty()}
     return tuple(_named_effect(fitted[named.name], named, selection) for named in selection.named)
 
 
@@ -389,7 +390,11 @@ def _looked_at(evidence: Evidence, effects: Sequence[NamedEffect]) -> str:
     """Return which recorded quantities were looked at and are not among the causes."""
     followed = {key for named in effects for key in named.effect.keys}
     others = [key for key in evidence.surroundings if key not in followed]
-    return f" Looked at, and no cause by what this tells: {', '.join(others)}." if others else ""
+    return (
+        f" Recorded quantities that were tried and are no cause as far as these records tell: {', '.join(others)}."
+        if others
+        else ""
+    )
 
 
 def _next(

@@ -143,8 +143,12 @@ def _grown(
     family: Explanation | None,
     beginnings: tuple[Effect, ...] = (),
     not_first: Collection[str] = (),
+    onward: Selection | None = None,
 ) -> Selection:
-    """Add effects as long as one has a significant gain, at first that of `beginnings`; remove needless ones."""
+    """Add effects as long as one has a significant gain, at first that of `beginnings`; remove needless ones.
+
+    With `onward`, to those of that selection.
+    """
     structures: tuple[str, ...]
     now, structures = (family, (BIAS,)) if family else (base, ())
     start = now
@@ -152,6 +156,9 @@ def _grown(
     rivals: dict[str, list[Effect]] = {}
     dropped: set[str] = set()
     exchanged, rounds, trials = False, 0, 1.0
+    if onward:
+        now, structures, trials, dropped = onward.now, onward.structures, onward.trials, set(onward.dropped)
+        rivals, beginnings = {name: list(others) for name, others in onward.rivals.items()}, onward.beginnings
     finest = max(FINEST * float(np.ptp(now.y[now.used])), ROUNDING_LEFT * now.evidence.rounding)
     while len(rivals) < MOST_EFFECTS and rounds < MOST_ROUNDS and now.held_out.rms > finest:
         rounds += 1
@@ -193,10 +200,14 @@ def _grown(
     # Exchanged effects and removed structures may have made other effects unnecessary.
     with_structures, now = now, now.bare()
     now = _without_needless(now, set(rivals), restart=now is not with_structures)
+    before = now.held_out.rms
     now, named = _ended(start, now, rivals)
     dropped -= {one.name for one in named}
     kept = {one.name: rivals[one.name] for one in named}
-    return Selection(base, now, named, structures, tuple(sorted(dropped)), trials, beginnings, kept)
+    selection = Selection(base, now, named, structures, tuple(sorted(dropped)), trials, beginnings, kept)
+    # Beside what has replaced another effect, more may be seen.
+    replaced = named and now.held_out.rms < (1.0 - LEAST_GAIN) * before
+    return _grown(base, family, onward=selection) if replaced and not onward else selection
 
 
 def _ended(

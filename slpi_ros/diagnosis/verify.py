@@ -110,14 +110,14 @@ class RecordVerification:
         """`PASSED`, `FAILED`, or `UNPROVED`.
 
         Nothing is proved if too few samples are judged, if the state alone may exceed the limit, or if the error is
-        small on a record that the model was identified from.
+        small on a record that the model was identified from, or without a quantity that the model follows.
         """
         hidden = self.absolute and not self.begins_known and self.offset_uncertainty > self.limit
         if self.share < LEAST or (hidden and self.rest.rms <= self.limit):
             return UNPROVED
         if self.judged_error > self.limit:
             return FAILED
-        return PASSED if self.independent else UNPROVED
+        return PASSED if self.independent and not self.lacking else UNPROVED
 
     @property
     def passed(self) -> bool:

@@ -105,6 +105,7 @@ class FollowedGain(NamedTuple):
     followed: Followed
     gains: tuple[float, float]
     uncertainty: tuple[float, float]
+    error: float  # standard uncertainty of a reading in use, in the unit of the quantity
 
 
 class Unsure(NamedTuple):

@@ -5,7 +5,7 @@ The running line has a value and a slope, with equal poles (Brookner, Tracking a
 1998, Sec. 1.2: critically damped), and is continued by the time by which the held readings are late.
 """
 
-from math import exp
+from math import exp, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -21,10 +21,14 @@ TIME_CONSTANTS, MOST_READINGS, FINER = np.array([0.5, 1.0, 1.5, 2.0, 3.0, 4.0, 6
 
 
 class ReadingsFilter(NamedTuple):
-    """Filter of readings in use: time constant (s), 0: none; time by which the line is continued (s), 0: the mean."""
+    """Filter of readings in use: time constant (s), 0: none; time by which the line is continued (s), 0: the mean.
+
+    `error` is the rms by which it is off the quantity, in its unit.
+    """
 
     time_constant: float = 0.0
     ahead: float = 0.0
+    error: float = 0.0
 
 
 def line_after(dt: float, time_constant: float, reading: float, value: float, slope: float) -> tuple[float, float]:
@@ -48,12 +52,13 @@ def best_filter(course: Course, lead: float = 0.0) -> ReadingsFilter:
     grid = np.arange(t[0], t[-1] - lead, step)
     true = np.interp(grid + lead, *smoothed((t, value)))
     held = value[np.searchsorted(t, grid, side="right") - 1]
-    best, least = ReadingsFilter(), float(np.mean((held - true) ** 2))
+    least = float(np.mean((held - true) ** 2))
+    best = ReadingsFilter(error=sqrt(least))
     for time_constant in (interval * TIME_CONSTANTS).tolist():
         for tried in (ReadingsFilter(time_constant), ReadingsFilter(time_constant, lead + 0.5 * interval)):
             error = float(np.mean((_filtered(tried, held - true[0], step) + true[0] - true) ** 2))
             if error < least:
-                best, least = tried, error
+                best, least = tried._replace(error=sqrt(error)), error
     return best
 
 

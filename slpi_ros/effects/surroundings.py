@@ -54,7 +54,9 @@ class Quantity:
 
     topic: str = text("topic on which it is measured")
     field: str = text("field of the messages, where they have several", default="")
-    reference: float = parameter("", "value at which it changes nothing, in its unit", -1e30, 1e30, default=0.0)
+    reference: float = parameter(
+        "", "value at which it changes nothing, in its unit", -1e30, 1e30, default=0.0, required=True
+    )
     offset_gain: float = parameter(
         "m", "displacement for one unit", -1e6, 1e6, default=0.0, fit=Fit("linear", absent=True)
     )
@@ -76,8 +78,12 @@ class Quantity:
         "s", "time by which their running line is continued in use, 0: their mean is taken", 0, 1e7, default=0.0
     )
     # Range of the recorded values.
-    lowest: float = parameter("", "lowest recorded value, in its unit", -1e30, 1e30, default=0.0)
-    highest: float = parameter("", "highest recorded value, in its unit", -1e30, 1e30, default=0.0)
+    lowest: float = parameter("", "lowest recorded value, in its unit", -1e30, 1e30, default=0.0, required=True)
+    highest: float = parameter("", "highest recorded value, in its unit", -1e30, 1e30, default=0.0, required=True)
+    # Of readings that come in use, with their filter.
+    reading_error: float = parameter(
+        "", "rms by which a reading in use is off the quantity, in its unit", 0, 1e30, default=0.0
+    )
 
     @property
     def key(self) -> str:
@@ -130,10 +136,13 @@ class Surroundings(EffectBase):
         super().__post_init__()
         keys = [one.key for one in self.quantities]
         ranges = all(one.lowest <= one.highest for one in self.quantities)
+        known = [one for one in self.quantities if one.lowest < one.highest]
+        inside = all(one.lowest <= one.reference <= one.highest for one in known)
         require(
             self,
             ("quantities", len(set(keys)) == len(keys), "different ones"),
             ("quantities", ranges, "with a lowest value up to the highest"),
+            ("quantities", inside, "with a reference from the lowest to the highest value"),
             ("quantities", all(0 < len(key) <= 400 and key.isprintable() for key in keys), "with printable topics"),
         )
 
@@ -144,7 +153,8 @@ class Surroundings(EffectBase):
         for k, (one, followed) in enumerate(zip(self.quantities, self.followed, strict=True)):
             names = (f"quantities.{k}.{name}" for name in ("offset_gain", "sensitivity_gain"))
             zero, sensitivity = (self.uncertainty.get(name, 0.0) for name in names)
-            found.append(FollowedGain(followed, (one.offset_gain, one.sensitivity_gain), (zero, sensitivity)))
+            gains = one.offset_gain, one.sensitivity_gain
+            found.append(FollowedGain(followed, gains, (zero, sensitivity), one.reading_error))
         return Unsure(quantities=tuple(found), origin=self.origin)
 
     @property
@@ -387,7 +397,7 @@ class StreamingSurroundings(StreamingBase):
 def _with_filter(one: Quantity, courses: Sequence[Course]) -> Quantity:
     """Return a quantity with the filter of its readings that takes the least time, of those that suit the records."""
     found = min((best_filter(course, one.lead) for course in courses), default=ReadingsFilter())
-    return replace(one, averaging=found.time_constant, ahead=found.ahead)
+    return replace(one, averaging=found.time_constant, ahead=found.ahead, reading_error=found.error)
 
 
 def _advanced(value: FloatArray, lead: float, around: EffectContext) -> FloatArray:

@@ -21,7 +21,7 @@ from slpi_ros.io.bag_storage import MessageBlock, read_mcap, read_sqlite
 from slpi_ros.io.input_limits import MOST_AXES, require_count
 from slpi_ros.io.messages import JOINT_STATE, MESSAGE_TYPES, QUANTITY_TYPES, SECOND_NS, Message, kind_of, read_message
 from slpi_ros.io.record import BLOCK, Course, Record, each_block, new_column, order_note, release
-from slpi_ros.io.surroundings import MOST, Chosen, courses, since_start_of, topics_beside
+from slpi_ros.io.surroundings import MOST, Chosen, courses, since_start_of, topics_beside, wild
 
 _Path = str | os.PathLike[str]
 
@@ -119,6 +119,9 @@ def _with_surroundings(
     notes = list(record.notes)
     if unread:
         notes.append(f"not read: {', '.join(unread)}")
+    for key, (_, value) in found.items():
+        if count := np.count_nonzero(wild(value)):
+            notes.append(f"{key}: {count} of {value.size} readings are far from all others and left out")
     if wanted is None and len(found) > MOST:
         notes.append(f"the first {MOST} of {len(found)} quantities are read; name others (--with)")
         found = dict(list(found.items())[:MOST])

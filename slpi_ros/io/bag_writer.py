@@ -17,8 +17,9 @@ from rosbags.typesys import Stores, TypesysError, get_typestore
 from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.bag_files import absolute_name, one_line, partial_path
+from slpi_ros.io.cdr import float64
 from slpi_ros.io.desired import DESIRED
-from slpi_ros.io.messages import JOINT_STATE, encode_joint_states
+from slpi_ros.io.messages import FLOAT64, JOINT_STATE, encode_joint_states
 from slpi_ros.io.record import Record
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
@@ -141,24 +142,29 @@ def write_bag(
 ) -> None:
     """Write a record as a new rosbag2 folder that `slpi_ros.read_bag` reads back without loss, id as ``frame_id``.
 
-    Desired displacements (m), (N,), NaN: none, of some axes become ``desired_displacement``.
+    Desired displacements (m), (N,), NaN: none, of some axes become ``desired_displacement``, and recorded quantities
+    without a field topics of their names, ``std_msgs/Float64``.
     """
     displacement = np.column_stack([record.displacement[axis] for axis in record.axes])
     voltage = np.column_stack([record.voltage[axis] for axis in record.axes])
     messages = encode_joint_states(record.time_ns, displacement, voltage, record.axes, record.hardware_id)
     # Readers sort by log time, which must not decrease: so the order of the record is kept where its stamps decrease.
     logged = np.maximum.accumulate(record.time_ns)
-    with BagWriter(path, storage=storage, topic=topic, replace=replace) as bag:
-        if not desired:
-            for stamp, message in zip(logged.tolist(), messages, strict=True):
-                bag.write(stamp, message)
-            return
-        bag.add_topic(DESIRED)
+    written = [(stamp, topic, message) for stamp, message in zip(logged.tolist(), messages, strict=True)]
+    if desired:
         paths = np.column_stack([*desired.values()])
         wanted = encode_joint_states(record.time_ns, paths, np.full_like(paths, np.nan), tuple(desired))
-        for stamp, message, path_message in zip(logged.tolist(), messages, wanted, strict=True):
-            bag.write(stamp, message)
-            bag.write(stamp, path_message, DESIRED)
+        written += [(stamp, DESIRED, message) for stamp, message in zip(logged.tolist(), wanted, strict=True)]
+    beside = {key: course for key, course in record.surroundings.items() if ":" not in key}
+    for key, (t, value) in beside.items():
+        stamps = (int(record.time_ns[0]) + np.rint(t * 1e9).astype(np.int64)).tolist()
+        written += [(at, key, float64(each)) for at, each in zip(stamps, value.tolist(), strict=True)]
+    with BagWriter(path, storage=storage, topic=topic, replace=replace) as bag:
+        for name, kind in ((DESIRED, JOINT_STATE), *((key, FLOAT64) for key in beside)):
+            if name != DESIRED or desired:
+                bag.add_topic(name, kind)
+        for stamp, name, message in sorted(written, key=lambda one: one[0]):
+            bag.write(stamp, message, name)
 
 
 @cache

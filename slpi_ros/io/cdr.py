@@ -168,6 +168,11 @@ def serialise(*values: int | str | Sequence[float]) -> bytes:
     return bytes(data)
 
 
+def float64(value: float) -> bytes:
+    """Return a serialised Float64, in this machine's byte order."""
+    return struct.pack("=2B2xd", 0, sys.byteorder == "little", value)
+
+
 def multiarray_header(count: int) -> bytes:
     """Return the CDR header of a Float64MultiArray with `count` doubles, in this machine's byte order."""
     # No dimensions and data offset 0; the doubles then start at a multiple of eight bytes.

@@ -228,6 +228,8 @@ class ColumnChoice:
     displacement: Mapping[str, Column]
     desired: Mapping[str, Column] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()  # names of desired columns, each with the reason
+    quantities: tuple[str, ...] = ()  # columns of recorded quantities, named by their topics
+    others: tuple[str, ...] = ()  # columns that are nothing of this
 
     def columns(self) -> tuple[Column, ...]:
         """Return all columns."""
@@ -267,9 +269,15 @@ def choose_columns(names: Sequence[str], options: ColumnOptions, source: str) ->
     desired, of_none = _of_axes(wanted, moved, axes, source, named=bool(options.desired))
     left_out += [f"'{column.name}': no axis '{column.axis}'" for column in of_none]
     _require_one_role(time, (*moved, *desired.values()), driven, source)
+    used = {*taken, *(column.name for column in wanted)}
+    rest = [name for name in names if name not in used]
+    quantities = [name for name in rest if name.startswith("/")]
+    told = {text.partition("'")[2].partition("'")[0] for text in left_out}
+    others = [name for name in rest if name not in quantities and name not in told and name]
     return ColumnChoice(
-        time, dict(zip(axes, driven, strict=True)), dict(zip(axes, moved, strict=True)), desired, tuple(left_out)
-    )
+        time, dict(zip(axes, driven, strict=True)), dict(zip(axes, moved, strict=True)), desired, tuple(left_out),
+        tuple(quantities), tuple(others),
+    )  # fmt: skip
 
 
 def _time_column(names: Sequence[str], source: str) -> str:

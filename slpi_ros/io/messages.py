@@ -13,6 +13,7 @@ from slpi_ros.io.cdr import CdrLayout, CdrReader, serialise
 from slpi_ros.io.input_limits import MOST_AXES, LimitError, require_count
 
 JOINT_STATE, JOINT_TRAJECTORY = "sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"
+FLOAT64 = "std_msgs/msg/Float64"
 SECOND_NS = 1_000_000_000
 # header stamps count seconds in int32
 _STAMP_END = 2**31 * SECOND_NS
@@ -82,7 +83,7 @@ class MessageType:
 
 MESSAGE_TYPES = {
     JOINT_STATE: MessageType(True, True, ("position", "effort"), _read_joint_state),
-    "std_msgs/msg/Float64": MessageType(False, False, ("data",), _read_number),
+    FLOAT64: MessageType(False, False, ("data",), _read_number),
     "std_msgs/msg/Float64MultiArray": MessageType(False, False, ("data",), _read_array),
     "geometry_msgs/msg/Vector3Stamped": MessageType(True, True, ("vector",), _read_vector),
 }
@@ -91,7 +92,7 @@ QUANTITY_TYPES = {
     "sensor_msgs/msg/Temperature": _measured("temperature"),
     "sensor_msgs/msg/RelativeHumidity": _measured("relative_humidity"),
     "sensor_msgs/msg/FluidPressure": _measured("fluid_pressure"),
-    "std_msgs/msg/Float64": MESSAGE_TYPES["std_msgs/msg/Float64"],
+    FLOAT64: MESSAGE_TYPES[FLOAT64],
     "geometry_msgs/msg/WrenchStamped": MessageType(True, True, ("force", "torque"), _read_wrench),
     JOINT_STATE: MESSAGE_TYPES[JOINT_STATE],
 }

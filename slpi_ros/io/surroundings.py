@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from slpi_ros.arrays import FloatArray, IntArray
+from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.errors import RecordError
 from slpi_ros.io.alignment import Signals
 from slpi_ros.io.input_limits import LimitError
@@ -33,6 +33,9 @@ IS_NOISE = 1.3
 SECOND_DIFFERENCES = 0.6745 * 6.0**0.5
 # A reading of a larger magnitude is missing: its square is no number.
 LARGEST = 1e100
+# Of at least this number of readings, up to so many in a row are no readings of the quantity if they are beyond the
+# range of nearly all others, between these quantiles, by this multiple of it.
+FEWEST_TO_JUDGE, IN_A_ROW, USUAL, FAR = 20, 2, (0.05, 0.95), 5.0
 
 
 class Chosen(NamedTuple):
@@ -126,12 +129,28 @@ def value_of(data: bytes, msgtype: str, field: str) -> float | None:
 
 
 def clean(course: Course) -> Course:
-    """Return a course without missing readings, at increasing times."""
+    """Return a course without missing and wild readings, at increasing times."""
     t, value = course
     known = np.isfinite(t) & (np.abs(value) < LARGEST)
     t, value = t[known], value[known]
     later = np.diff(t, prepend=-np.inf) > 0.0
-    return t[later], value[later]
+    t, value = t[later], value[later]
+    kept = ~wild(value)
+    return t[kept], value[kept]
+
+
+def wild(value: FloatArray) -> Mask:
+    """Return which readings, (n,), are no readings of the quantity: single ones far from all others, shape (n,)."""
+    # A thermometer that has just been switched on says 85 degrees, one without contact -127.
+    if value.size < FEWEST_TO_JUDGE:
+        return np.zeros(value.size, dtype=bool)
+    low, high = np.quantile(value, USUAL)
+    far = (value < low - FAR * (high - low)) | (value > high + FAR * (high - low))
+    ends = np.flatnonzero(np.diff(np.concatenate([[False], far, [False]]).astype(np.int8)))
+    for begin, end in ends.reshape(-1, 2).tolist():
+        far[begin:end] &= end - begin <= IN_A_ROW
+    # What is constant but for single readings is not known to be without them.
+    return np.asarray(far & (high > low), dtype=bool)
 
 
 def smoothed(course: Course) -> Course:

@@ -14,7 +14,7 @@ from slpi_ros.errors import RecordError
 from slpi_ros.io.atomic_file import all_or_nothing
 from slpi_ros.io.columns import Column, ColumnChoice, ColumnOptions, choose_columns, match_column
 from slpi_ros.io.input_limits import MOST_AXES
-from slpi_ros.io.record import Record
+from slpi_ros.io.record import Course, Record
 from slpi_ros.io.table_files import CsvTable, MatTable, load_csv, load_mat
 
 # message stamps count seconds in int32
@@ -34,7 +34,8 @@ def import_table(
     # The table is a text file with a line of column names above the numbers, separated by comma, semicolon or tab; with
     # semicolon or tab, decimal commas are allowed. Or it is a MATLAB file (``.mat``, up to version 7), whose numeric
     # vectors are the columns. A column name may contain a unit; without, units are seconds, volts and
-    # `displacement_unit`, by default micrometres. Empty cells and ``nan`` become NaN. If the first time is negative,
+    # `displacement_unit`, by default micrometres. Columns named by a topic, such as ``/room/temperature``, are recorded
+    # quantities; other ones are left out. Empty cells and ``nan`` become NaN. If the first time is negative,
     # all times are shifted such that the record begins at 0.
     options = ColumnOptions(time, tuple(voltage), tuple(displacement), displacement_unit, tuple(axes))
     return import_with_summary(path, options).record
@@ -54,15 +55,24 @@ def import_with_summary(path: str | os.PathLike[str], options: ColumnOptions) ->
     path = Path(path)
     table = load_mat(path) if path.suffix.lower() == ".mat" else load_csv(path)
     choice = choose_columns(table.columns, options, str(path))
-    values = table.read([column.name for column in choice.columns()])
+    values = table.read([*(column.name for column in choice.columns()), *choice.quantities])
+    time_ns = _nanoseconds(_si(values, choice.time), choice.time.name, table)
+    t = (time_ns - time_ns[0]) * 1e-9
     record = Record(
-        time_ns=_nanoseconds(_si(values, choice.time), choice.time.name, table),
+        time_ns=time_ns,
         voltage={axis: _si(values, column) for axis, column in choice.voltage.items()},
         displacement={axis: _si(values, column) for axis, column in choice.displacement.items()},
         source=str(path),
+        surroundings={name: _readings(t, values[name]) for name in choice.quantities},
     )
     desired = {axis: _si(values, column) for axis, column in choice.desired.items()}
     return Imported(record, desired, tuple(_summary(record, desired, choice)))
+
+
+def _readings(t: FloatArray, values: FloatArray) -> Course:
+    """Return times (s) and values of a quantity where it has some: it may be read less often than the stage."""
+    known = np.isfinite(values)
+    return t[known], values[known]
 
 
 def _si(values: Mapping[str, FloatArray], column: Column) -> FloatArray:
@@ -78,8 +88,15 @@ def _summary(record: Record, desired: Mapping[str, FloatArray], choice: ColumnCh
         displacement = _column_summary(choice.displacement[axis], record.displacement[axis] * 1e6, "µm")
         wanted = _column_summary(choice.desired[axis], desired[axis] * 1e6, "µm") if axis in desired else ""
         yield f"axis {axis}: {voltage}, {displacement}{', desired ' + wanted if wanted else ''}"
+    for name, (_, readings) in record.surroundings.items():
+        yield f"quantity {name}: {readings.size} readings"
     for reason in choice.left_out:
         yield f"left out, column {reason}; name the columns of desired displacements in units of length (--desired)"
+    if choice.others:
+        yield (
+            f"left out, columns {', '.join(choice.others)}; one that is named by a topic, such as /room/temperature, "
+            "is read as a recorded quantity"
+        )
 
 
 def _column_summary(column: Column, values: FloatArray, unit: str) -> str:

@@ -37,7 +37,7 @@ COMPONENTS = {
     "uncovered": "regions and rates that the records do not cover",
     "memory": "unknown memory of the hysteresis at the start, and creep from before it",
     "age": "drift and creep since the last reset or calibration",
-    "surroundings": "recorded quantities: their gains, and values that are not known",
+    "surroundings": "recorded quantities: their gains, readings in use, and values that are not known",
 }
 
 
@@ -361,8 +361,9 @@ class StreamingUncertainty:
 
 def _quantity_square(one: FollowedGain, value: Scalars | None, moved: Scalars) -> Scalars:
     """Return the square of the uncertainty (m^2) for values or None, `moved` (m) away from the origin."""
-    (_, reference, lowest, highest), (zero, sensitivity), (own, of_sensitivity) = one
+    (_, reference, lowest, highest), (zero, sensitivity), (own, of_sensitivity), error = one
+    follows = zero + sensitivity * moved
     if value is None:
         # It is anywhere in its recorded range.
-        return ((zero + sensitivity * moved) * (RECTANGULAR * (highest - lowest))) ** 2
-    return (own * own + (of_sensitivity * moved) ** 2) * (value - reference) ** 2
+        return (follows * (RECTANGULAR * (highest - lowest))) ** 2
+    return (own * own + (of_sensitivity * moved) ** 2) * (value - reference) ** 2 + (follows * error) ** 2

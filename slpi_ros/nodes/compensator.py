@@ -22,11 +22,9 @@ from std_msgs.msg import Float64, Float64MultiArray, String
 from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
-from slpi_ros.compensator.amplifier import Calibration
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.ownership import AUTO
-from slpi_ros.compensator.path_watch import PathWatch
 from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESTORED, MemoryFile, model_id
 from slpi_ros.compensator.validation import STALE, RejectedError
 from slpi_ros.errors import ModelError, SlpiError, shown
@@ -50,13 +48,14 @@ from slpi_ros.nodes.common import (
 )
 from slpi_ros.nodes.compensator_diagnostics import Reporter
 from slpi_ros.nodes.compensator_parameters import DECLARATIONS, CompensatorSettings
+from slpi_ros.nodes.compensator_remarks import LOG_PERIOD, Remarks
 from slpi_ros.nodes.jobs import Read, Reading
 from slpi_ros.nodes.parameters import Parameters
 from slpi_ros.nodes.path_learning import OFF, PathLearning
 from slpi_ros.nodes.surroundings import SurroundingsTopics
 
-# Minimum time between two log messages of the same kind, seconds.
-LOG_PERIOD, FILE_LOG_PERIOD = 5.0, 60.0
+# Minimum time between two log messages about files, seconds.
+FILE_LOG_PERIOD = 60.0
 # Period of the watchdog check, of `tracking_error` and of `displacement_uncertainty`, seconds.
 WATCH_PERIOD = 0.05
 # Polling period of a simulated clock, seconds.
@@ -105,23 +104,18 @@ class Compensator(LifecycleNode):
         self._desired, self._measured = JointStates(), JointStates()
         self._voltage_header = multiarray_header(len(values["axes"]))
         self._failure: SlpiError | None = None
-        self._excursions = 0
-        self._too_fast = ""
         self._assumption = ""
         self._memory_file = MemoryFile(values["memory_file"])
         self._memory_waits = False
         self._keeps_memory = values["memory_file"] != ""
         self._reporter = Reporter(self, self._controller)
+        self._remarks = Remarks(self, self._controller, lambda: self._report_at_least(WARN))
         self._reset_service = DeferredService(self, "~/reset_memory", self._on_reset)
         self._forget_service = DeferredService(self, "~/forget", self._on_forget)
         self._learning_held: set[str] = set()
         self.create_service(Trigger, "~/arm", self._on_arm)
         self.create_service(Trigger, "~/set_zero", self._on_set_zero)
-        self._doubts: dict[str, str] = {}
-        self._noted: set[str] = set()
         self._uncertainty_unknown = ""
-        self._calibrations: dict[str, Calibration] = {}
-        self._beyond: dict[str, PathWatch] = {}
         # The age of one command for each report: reading the clock takes as long as compensating an axis.
         self._measures_age = True
         self._state_topic = self.resolve_topic_name("stage_state")
@@ -340,7 +334,7 @@ class Compensator(LifecycleNode):
             self._reporter.age = (self.get_clock().now().nanoseconds - stamp_ns) * 1e-9
         self._reporter.timing.note(now_ns, time.monotonic_ns())
         if held:
-            self._warn_held()
+            self._remarks.tell_held()
 
     def _on_measured(self, data: bytes) -> None:
         stamp_ns, names, displacements = self._measured.read(data) or as_rclpy_reads(data)
@@ -401,7 +395,7 @@ class Compensator(LifecycleNode):
         response.message = why or (f"already armed, at {at} V" if was_armed else f"armed at {at} V")
         if not was_armed:
             self.get_logger().info(f"~/arm: {response.message}")
-            self._tell_doubts()
+            self._remarks.tell_doubts()
             self._report()
         return response
 
@@ -442,49 +436,11 @@ class Compensator(LifecycleNode):
         if not ownership.started:
             ownership.reporting = self._reports_expected
             self._controller.locate(time.monotonic_ns())
-            self._tell_doubts()
+            self._remarks.tell_doubts()
         # A first message may have found the voltages before this.
         if self._memory_waits and not ownership.obstacle:
             self._begin_memory()
             self._report()
-
-    def _tell_notes(self) -> None:
-        """Log once what is not certain about the voltages at the start."""
-        notes = {name: note for name, note in self._controller.ownership.notes.items() if note}
-        if not self._controller.ownership.obstacle and notes and notes.keys() != self._noted:
-            self._noted = set(notes)
-            for name, note in notes.items():
-                self.get_logger().warning(f"axis '{name}': {note}")
-
-    def _tell_calibrations(self) -> None:
-        """Log once that the reported voltages differ by a constant gain or offset, which is not followed."""
-        for axis in self._controller.axes:
-            found = axis.amplifier.calibration
-            if found != self._calibrations.get(axis.name, Calibration()):
-                self._calibrations[axis.name] = found
-                self.get_logger().warning(
-                    f"axis '{axis.name}': stage_state reports {found.gain:.4g} times the output {found.offset:+.4g} V "
-                    "(effort): a matter of calibration, it is not followed"
-                )
-
-    def _tell_beyond(self) -> None:
-        """Log once for each model that a path is faster than its record."""
-        for axis in self._controller.axes:
-            if axis.path is not self._beyond.get(axis.name) and axis.path.beyond:
-                self._beyond[axis.name] = axis.path
-                self.get_logger().warning(
-                    f"axis '{axis.name}': {axis.path.beyond}; errors may be larger than told, record at that rate "
-                    "(slpi excite --for-path)"
-                )
-                self._report_at_least(WARN)
-
-    def _tell_doubts(self) -> None:
-        """Log once what has become doubtful about the memory of an axis."""
-        for axis in self._controller.axes:
-            doubt = axis.confidence.doubt
-            if doubt and doubt != self._doubts.get(axis.name):
-                self.get_logger().warning(f"axis '{axis.name}': {doubt}", throttle_duration_sec=LOG_PERIOD)
-            self._doubts[axis.name] = doubt
 
     def _on_trajectory(self, data: bytes) -> None:
         controller = self._controller
@@ -506,8 +462,7 @@ class Compensator(LifecycleNode):
         self._learning.begin(path, start_ns, clock_ns)
         self._on_simulated = self._simulated
         self.get_logger().info(f"trajectory: {controller.trajectory.remaining} points to come")
-        self._too_fast = ""
-        self._tell_too_fast()
+        self._remarks.tell_too_fast(anew=True)
         self._report()
 
     def _send_block(self, names: Sequence[str], times: ArrayLike, positions: ArrayLike, later: bool) -> None:
@@ -525,8 +480,7 @@ class Compensator(LifecycleNode):
         self.get_logger().info(
             f"block: {len(block.voltages)} samples of {block.period:g} s, the path begins after {block.lead_in}"
         )
-        self._too_fast = ""
-        self._tell_too_fast()
+        self._remarks.tell_too_fast(anew=True)
         self._report()
 
     def _stop_block(self) -> None:
@@ -550,13 +504,6 @@ class Compensator(LifecycleNode):
             self._save_memory(complete=False)
             self._report()
 
-    def _tell_too_fast(self) -> None:
-        """Log once that a trajectory is too fast for the slew limit."""
-        said = self._controller.too_fast
-        if said and said != self._too_fast:
-            self._too_fast = said
-            self.get_logger().warning(f"trajectory {said}; send it more slowly, or raise slew_limit")
-
     def _tell_late(self) -> None:
         """Log that points of a trajectory were skipped, or late."""
         if late := self._reporter.late():
@@ -578,22 +525,6 @@ class Compensator(LifecycleNode):
             except ModelError as error:
                 self.get_logger().error(str(error), throttle_duration_sec=FILE_LOG_PERIOD)
         self._publisher.publish(self._voltage_header + voltages)
-
-    def _warn_held(self) -> None:
-        """Warn once for each excursion beyond the reachable displacements."""
-        self._report_at_least(WARN)
-        if self._controller.counts.excursions > self._excursions:
-            self._excursions = self._controller.counts.excursions
-            held = [axis for axis in self._controller.axes if axis.held]
-            out = [f"axis {axis.name}{_reach(axis)}" for axis in held]
-            remedy = "send displacements within the identified range"
-            if all(_in_range(axis) for axis in held):
-                remedy = (
-                    "that is within the range: send a slower path, one further from its ends, or widen voltage_min and "
-                    "voltage_max if they are narrower than the model"
-                )
-            said = f"desired displacement out of reach, held at a voltage limit: {', '.join(out)}"
-            self.get_logger().warning(f"{said}; {remedy}")
 
     # Motion without messages
 
@@ -634,10 +565,10 @@ class Compensator(LifecycleNode):
                 self._learning.passes.output(controller.axes, clock_ns)
             if before is OperatingMode.TRAJECTORY and deadline_ns is not None and deadline_ns <= clock_ns:
                 self._reporter.lateness.note(deadline_ns, clock_ns)
-            if controller.counts.points_held > held or controller.counts.excursions > self._excursions:
-                self._warn_held()
+            if controller.counts.points_held > held or self._remarks.has_excursion:
+                self._remarks.tell_held()
             if controller.too_fast:
-                self._tell_too_fast()
+                self._remarks.tell_too_fast()
         if controller.mode is not before:
             if before is OperatingMode.RESETTING:
                 self._answer_reset()
@@ -667,9 +598,9 @@ class Compensator(LifecycleNode):
         self._work_off()
         self._watch_surroundings(now_ns)
         self._locate()
-        self._tell_notes()
-        self._tell_calibrations()
-        self._tell_beyond()
+        self._remarks.tell_notes()
+        self._remarks.tell_calibrations()
+        self._remarks.tell_beyond()
         if why := controller.watch_block(now_ns):
             self.get_logger().error(f"block given up: {why}")
             self._report()
@@ -907,24 +838,6 @@ class Compensator(LifecycleNode):
             self._memory_file.save(controller.identified, axes, complete)
         except SlpiError as error:
             self.get_logger().error(str(error), throttle_duration_sec=FILE_LOG_PERIOD)
-
-
-def _reach(axis: Axis) -> str:
-    """Return the desired displacement of an axis beside the identified range as text."""
-    desired, model = axis.tracking.desired, axis.model
-    if desired is None or model is None:
-        return ""
-    low, high = model.displacement_range
-    return f" at {desired * 1e6:.5g} of {low * 1e6:.5g} to {high * 1e6:.5g} µm"
-
-
-def _in_range(axis: Axis) -> bool:
-    """Return whether the desired displacement of an axis is in the identified range: what is too much is its rate."""
-    desired, model = axis.tracking.desired, axis.model
-    if desired is None or model is None:
-        return False
-    low, high = model.displacement_range
-    return low <= desired <= high
 
 
 def _read_trajectory(data: bytes) -> tuple[int, Sequence[str], ArrayLike, ArrayLike]:

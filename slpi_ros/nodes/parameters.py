@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from difflib import get_close_matches
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -13,6 +14,8 @@ from slpi_ros.errors import SlpiError, UsageError
 
 Settings = TypeVar("Settings")
 Values = Mapping[str, Any]
+# Parameters that rclpy declares, some of them later.
+KNOWN_TO_RCLPY = ("use_sim_time", "qos_overrides", "start_type_description_service")
 
 
 @dataclass(frozen=True)
@@ -92,6 +95,17 @@ class Parameters(Generic[Settings]):
             for entry in declarations
         }
         self.settings = make(self._values)
+        self._tell_unknown(node)
+
+    def _tell_unknown(self, node: Node) -> None:
+        """Warn of parameters that are given and that the node does not have: a misspelt limit would be none."""
+        given: Mapping[str, Any] = getattr(node, "_parameter_overrides", {})
+        for name in given:
+            if name.partition(".")[0] not in KNOWN_TO_RCLPY and not node.has_parameter(name):
+                near = get_close_matches(name, self._values, 1)
+                node.get_logger().warning(
+                    f"there is no parameter {name}, it changes nothing{f'; {near[0]} is meant?' if near else ''}"
+                )
 
     def follow(self, apply: Callable[[Settings], None], check: Callable[[Settings], None] | None = None) -> None:
         """Allow parameter changes unless `check` raises SlpiError; call `apply` with the new settings."""

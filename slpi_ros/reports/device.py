@@ -6,8 +6,9 @@ from collections.abc import Sequence
 from slpi_ros.drivers.base import Found
 from slpi_ros.reports.doctor import FAILED, NOTE, OK, Check
 
-# The limits to start with: so far on each side of the present voltage, V.
-NARROW = 5.0
+# The limits to start with: so far on each side of the present voltage, V, but no more than this share of the device's
+# own range, as an amplifier behind it makes more of it.
+NARROW, NARROW_SHARE = 5.0, 0.05
 # Cycles per second to choose from: a reading shall take at most half a period, as writing may take as long again.
 RATES = (1000, 500, 200, 100, 50, 20)
 # Metres to start with for one unit of the position: 1 um; where that is the voltage of a sensor, 100 um for 10 V.
@@ -72,8 +73,10 @@ def device_parameters(kind: str, address: str, found: Found, channels: Sequence[
 
     `cycle` is the time of one reading, s.
     """
-    lower = [max(low, v - NARROW) for low, v in zip(found.lowest, found.setpoints, strict=True)]
-    upper = [min(high, v + NARROW) for high, v in zip(found.highest, found.setpoints, strict=True)]
+    ranges = list(zip(found.setpoints, found.lowest, found.highest, strict=True))
+    narrow = min([NARROW, *(NARROW_SHARE * (high - low) for _, low, high in ranges)])
+    lower = [max(low, v - narrow) for v, low, _ in ranges]
+    upper = [min(high, v + narrow) for v, _, high in ranges]
     axes = ["x", "y", "z"] if len(channels) <= 3 else [f"axis{number}" for number in range(1, len(channels) + 1)]
     # With quotation marks: YAML takes a bare y for a boolean.
     names, texts = (", ".join(f"'{each}'" for each in some) for some in (axes[: len(channels)], channels))
@@ -90,10 +93,11 @@ def device_parameters(kind: str, address: str, found: Found, channels: Sequence[
         "    # Around the present voltage; the limits of the stage, once the first hour is over.",
         f"    voltage_min: [{', '.join(f'{v:.3f}' for v in lower)}]",
         f"    voltage_max: [{', '.join(f'{v:.3f}' for v in upper)}]",
-        f"    slew_limit: {2.0 * NARROW:.1f}",
+        f"    slew_limit: {2.0 * narrow:.4g}",
         f"    # One reading takes {1e3 * cycle:.2g} ms.",
         f"    rate: {rate:.1f}",
-        "    # V at the stage, as the limits above are, for one volt of the device: of an amplifier behind it.",
+        "    # V at the stage for one volt of the device: of an amplifier behind it. Set it before anything moves, and",
+        "    # multiply the limits above by it.",
         "    amplifier_gain: 1.0",
         f"    # Metres for one unit of the position in the table ({unit}).",
         f"    sensor_scale: {scale:.1e}",

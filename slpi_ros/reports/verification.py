@@ -86,8 +86,7 @@ def verification_limits(found: Verification) -> dict[str, str]:
             worst, unproved = axis.worst, axis.verdict == UNPROVED
             limit = _limiting(worst)
             if unproved:
-                own = "" if axis.unproved.independent else " on a record that the model was identified from"
-                limit = f"unproved{own}"
+                limit = f"unproved{_where_unproved(axis.unproved)}"
             said.append(f"{limit}, {length(worst.judged_error)} rms where {length(worst.limit)} are allowed")
         path = max(tracked, key=lambda tracking: tracking.error.rms, default=None)
         if path and path.error.rms > max(axis.worst.limit, axis.worst.judged_error):
@@ -96,6 +95,12 @@ def verification_limits(found: Verification) -> dict[str, str]:
         if said:
             limits[name] = "; ".join(said)
     return limits
+
+
+def _where_unproved(record: RecordVerification) -> str:
+    if not record.independent:
+        return " on a record that the model was identified from"
+    return f" without {', '.join(record.lacking)}, which the model follows" if record.lacking else ""
 
 
 def _part(tracking: Tracking) -> str:
@@ -184,6 +189,8 @@ def _why_unproved(record: RecordVerification) -> str:
         return "Too few readings are left: check the sensor and its link, 'slpi doctor' tells what is wrong with them."
     if record.share >= LEAST and record.judged_error <= record.limit and not record.independent:
         return "The model was identified from this record, so that a small error proves nothing: record another one."
+    if record.share >= LEAST and record.judged_error <= record.limit and record.lacking:
+        return "Without what the model follows a small error proves nothing."
     if record.share >= LEAST:
         return (
             f"The initial state is unknown, which alone can be {length(record.offset_uncertainty)}: begin a record "

@@ -86,7 +86,7 @@ def _with_chosen(record: Record, chosen: Sequence[str] | None) -> Record:
 
 def require_causes(records: Sequence[Record], source: Source) -> None:
     """Warn of named quantities that can be no cause; RecordError if none of them can."""
-    _require_named(records, source, lambda record, _, course: no_cause(course, *_span(record, source)))
+    _require_named(records, source, lambda record, _, course: no_cause(record, course, *_span(record, source)))
 
 
 def require_followed(records: Sequence[Record], source: Source, model: StageModel) -> None:

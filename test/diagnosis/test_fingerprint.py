@@ -57,6 +57,12 @@ def test_frequencies_and_amplitudes_of_lines_are_told():
     assert "50.3 Hz (30" in found[0].evidence or "50.3 Hz (29" in found[0].evidence
 
 
+def test_a_few_periods_are_a_drift_and_no_line():
+    slow = np.sin(2 * np.pi * 4.3 / T[-1] * T) + 0.3 * np.random.default_rng(1).standard_normal(T.size)
+    assert {"time"} <= {one.variable for one in fingerprint([record(slow, 0)])} - {"lines of the spectrum"}
+    assert "lines of the spectrum" not in {one.variable for one in fingerprint([record(slow, 0)])}
+
+
 def test_half_of_the_power_is_below_a_frequency():
     slow = Signals(T, V, V, np.sin(2 * np.pi * 3.0 * T) + 0.9 * np.sin(2 * np.pi * 40.0 * T))
     assert half_power([slow]) == pytest.approx(3.0, abs=0.2)

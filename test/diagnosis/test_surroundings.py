@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from slpi_ros.diagnosis.diagnose import diagnose, following
+from slpi_ros.diagnosis.prepare import evidence_of, no_cause
 from slpi_ros.diagnosis.result import AMBIGUOUS
 from slpi_ros.diagnosis.verify import verify
 from slpi_ros.identification.fit import identify
@@ -96,6 +97,7 @@ def test_a_temperature_is_named_and_the_model_follows_it_on_another_day():
     judged = verify(later, diagnosis.extended).axes["x"]
     blind = verify(replace(later, surroundings={}), diagnosis.extended).axes["x"]
     assert judged.rest.rms < 15e-9 < 0.2 * blind.rest.rms
+    assert judged.passed and not blind.passed
     # That day is warmer than the record of the model: said, as is a quantity that is not known.
     told = judged.records[0].beyond, blind.records[0].beyond
     assert told[0] != told[1] and all(TOPIC in each for each in told)
@@ -127,7 +129,7 @@ def test_a_sensor_slower_than_the_stage_is_made_up_for_in_use():
     kept = np.exp(-4.0 / 6.0)
     assert one.lead == pytest.approx(4.0 * kept / (1.0 - kept), abs=1.0)
     (used,) = (each for effect in diagnosis.extended.axes["x"].effects for each in effect.quantities)
-    assert used.lead == one.lead and used.ahead == pytest.approx(one.lead + 2.0, abs=0.2)
+    assert used.lead == one.lead and used.reading_error > 0.0 and used.ahead == pytest.approx(one.lead + 2.0, abs=0.2)
 
 
 @pytest.mark.long
@@ -165,3 +167,18 @@ def test_an_identification_with_a_quantity_follows_it_or_says_not():
     (one,) = model.axes["x"].followed
     assert one.key == TOPIC
     assert len(told) == 1 and DECOY in told[0]
+
+
+@pytest.mark.parametrize("signal", ["displacement", "voltage"])
+def test_a_second_sensor_of_the_stage_is_no_cause(signal):
+    given = record(offset=2e-7)
+    at = np.arange(0.0, SECONDS, 0.25)
+    own = np.interp(at, T, getattr(given, signal)["x"])
+    echo = 3.0 * own / np.ptp(own) + 0.01 * np.random.default_rng(5).standard_normal(at.size)
+    given = replace(given, surroundings={**given.surroundings, "/laser": (at, echo)})
+    told = no_cause(given, given.surroundings["/laser"], 0.0, SECONDS)
+    assert "of axis 'x'" in told
+    assert not no_cause(given, given.surroundings[TOPIC], 0.0, SECONDS)
+    with pytest.warns(UserWarning, match="/laser"):
+        evidence = evidence_of([given], "x", None)
+    assert set(evidence.surroundings) == {TOPIC, DECOY}

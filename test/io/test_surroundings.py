@@ -9,7 +9,10 @@ from refusals import holds, refusal
 
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.bag_reader import read_bag
-from slpi_ros.io.surroundings import clean, named_in
+from slpi_ros.io.bag_writer import write_bag
+from slpi_ros.io.columns import ColumnOptions
+from slpi_ros.io.surroundings import clean, named_in, wild
+from slpi_ros.io.tables import import_table, import_with_summary
 
 SECOND = 10**9
 START = 1_700_000_000 * SECOND
@@ -137,3 +140,35 @@ def test_courses_have_one_value_for_each_time(tmp_path):
 def test_readings_too_large_for_arithmetic_are_missing():
     t, value = clean((np.arange(4.0), np.array([20.0, 1e308, -np.inf, 21.0])))
     assert t.tolist() == [0.0, 3.0] and value.tolist() == [20.0, 21.0]
+
+
+def test_single_readings_far_from_all_others_are_left_out_and_told(tmp_path):
+    rng = np.random.default_rng(2)
+    value = 21.0 + np.sin(np.arange(200) / 20) + 0.02 * rng.standard_normal(200)
+    value[[40, 90, 91]] = 85.0, -127.0, -127.0
+    assert np.flatnonzero(wild(value)).tolist() == [40, 90, 91]
+    assert clean((np.arange(200.0), value))[0].size == 197
+    # A load that is put on for a while, or a value that is mostly the same, is none.
+    load = np.where((np.arange(400) > 100) & (np.arange(400) < 110), 5.0, 0.01 * rng.standard_normal(400))
+    assert not wild(load).any() and not wild(np.r_[np.zeros(50), 1.0, np.zeros(50)]).any()
+    assert not wild(np.array([1.0, 1.1, 1.05, 90.0])).any()
+    at = START + (np.arange(200) * SECOND // 45)
+    beside = {"/temperature": [(int(k), temperature(int(k), x)) for k, x in zip(at, value, strict=True)]}
+    record = read_bag(rosbags_bag(tmp_path / "bag", {"/stage_state": STATE, **beside}))
+    assert any("/temperature" in note and "3 of 200" in note for note in record.notes)
+
+
+def test_columns_named_by_a_topic_are_quantities_of_the_bag_too(tmp_path):
+    lines = ["time_s,voltage_V,x_um,/room/temperature,humidity"]
+    lines += [f"{k / 10},{k % 7},{k % 5},{21.5 + k / 10 if k % 3 == 0 else ''},0.4" for k in range(30)]
+    (tmp_path / "data.csv").write_text("\n".join(lines))
+    record = import_table(tmp_path / "data.csv")
+    t, value = record.surroundings["/room/temperature"]
+    assert set(record.surroundings) == {"/room/temperature"}
+    np.testing.assert_allclose(t, np.arange(0, 30, 3) / 10) and np.testing.assert_allclose(value, 21.5 + t)
+    told = " ".join(import_with_summary(tmp_path / "data.csv", ColumnOptions()).summary)
+    assert holds(told, "/room/temperature", "10 readings", "humidity")
+    write_bag(tmp_path / "bag", record)
+    again = read_bag(tmp_path / "bag")
+    for one, other in zip(again.surroundings["/room/temperature"], (t, value), strict=True):
+        np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)

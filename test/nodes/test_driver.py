@@ -227,3 +227,14 @@ def test_what_cannot_work_ends_with_one_line(parameters, code, complaint):
         finally:
             process.kill()
     assert complaint in said and "Traceback" not in said and len(said.splitlines()) == 1
+
+
+def test_a_misspelt_parameter_is_told():
+    given = {"device": "gcs", "address": "127.0.0.1:1", **LIMITS, "slew_limt": 10.0}
+    process = NodeProcess("driver", given, ())
+    try:
+        assert process.wait() == 1
+        said = process.stderr
+    finally:
+        process.kill()
+    assert "slew_limt" in said and "slew_limit" in said

@@ -299,7 +299,11 @@ def of_stage(record: Record, course: Course) -> str:
 
 def few(at: FloatArray) -> str:
     """Return how many readings there are, at times `at` (s, (n,)), and how many are needed; "" if enough."""
-    return "" if at.size >= FEWEST_READINGS else f"{at.size} readings, at least {FEWEST_READINGS} are needed"
+    return (
+        ""
+        if at.size >= FEWEST_READINGS
+        else f"{at.size} readings at different times, at least {FEWEST_READINGS} are needed"
+    )
 
 
 def uncovered(at: FloatArray, begins: float, ends: float) -> str:

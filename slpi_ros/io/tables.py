@@ -119,7 +119,7 @@ def read_table_with(
 ) -> tuple[FloatArray, dict[str, FloatArray], dict[str, FloatArray]]:
     """Read times (s), finite values (V or m) by axis, and quantities by name, (N,) each, from a table of a command."""
     # The columns are ``time_s``, ``<axis>_<suffix>``, "V" or "m", and of `beside` those that are there, in any order;
-    # others are ignored.
+    # others are ignored. A quantity is held where its cells are empty.
     table = load_csv(Path(path))
     ending = _ending(suffix)
     own = [name for name in table.columns if name not in beside]
@@ -131,6 +131,8 @@ def read_table_with(
     time = match_column("time_s", table.columns)
     also = [name for name in beside if name in table.columns]
     values = table.read((time, *columns.values(), *also))
+    for name in also:
+        values[name] = _held(values[name])
     for column, samples in values.items():
         table.require(
             np.isfinite(samples),
@@ -141,6 +143,14 @@ def read_table_with(
     _require_order(values[time], time, table)
     by_axis = {axis: values[column] for axis, column in columns.items()}
     return values[time], by_axis, {name: values[name] for name in also}
+
+
+def _held(values: FloatArray) -> FloatArray:
+    """Return values, shape (N,), with the last known one, at the beginning the first, where they are not known."""
+    known = np.flatnonzero(np.isfinite(values))
+    if not known.size:
+        return values
+    return values[known[np.maximum(np.searchsorted(known, np.arange(values.size), side="right") - 1, 0)]]
 
 
 def write_table(path: str | os.PathLike[str], t: FloatArray, columns: Mapping[str, FloatArray], suffix: str) -> None:

@@ -22,12 +22,21 @@ def describe_uncertainty(axis: AxisModel, *, details: bool = True) -> list[str]:
         own = AxisUncertainty(axis, known_memory=True)
     except SlpiError as error:
         return [f"uncertainty: not known: {error}"]
-    told = [f"{length(float(_at(own, MIDDLE, seconds).expanded[0]))} after {name}" for name, seconds in TIMES.items()]
+    known = {one.key: one.reference for one in axis.followed}
+    told = [
+        f"{length(float(_at(own, MIDDLE, seconds, known).expanded[0]))} after {name}" for name, seconds in TIMES.items()
+    ]
     lines = [f"{RESET}, at the middle of the range: {', '.join(told)}"]
     if unknown := unknown_memory(axis):
         lines.append(
             f"without a reset: besides, standard uncertainty {length(unknown)} at first, until the voltage has gone "
             "over its range"
+        )
+    if known:
+        (without,) = _at(own, MIDDLE, TIMES["1 s"]).surroundings
+        lines.append(
+            f"while {' and '.join(known)} {'is' if len(known) == 1 else 'are'} not known: besides, standard uncertainty "
+            f"{length(float(without))}"
         )
     if not details:
         return lines
@@ -35,10 +44,10 @@ def describe_uncertainty(axis: AxisModel, *, details: bool = True) -> list[str]:
     lines.append(f"{'displacement, µm':<28}" + "".join(f"{name:>10}" for name in TIMES))
     for share in PLACES:
         y = own.low + share * own.stroke
-        figures = [float(own.at(y, seconds).expanded[0]) for seconds in TIMES.values()]
+        figures = [float(own.at(y, seconds, known).expanded[0]) for seconds in TIMES.values()]
         lines.append(f"{y * 1e6:<28.4g}" + "".join(f"{1e9 * each:10.1f}" for each in figures))
     lines.append("budget at the middle of the range, standard uncertainty, nm:")
-    budgets = [_at(own, MIDDLE, seconds) for seconds in TIMES.values()]
+    budgets = [_at(own, MIDDLE, seconds, known) for seconds in TIMES.values()]
     for name, what in (*COMPONENTS.items(), ("combined", "root of the sum of squares"), ("expanded", "coverage 2")):
         row = "".join(f"{1e9 * float(getattr(each, name)[0]):10.1f}" for each in budgets)
         lines.append(f"{name:<28}{row}  {what}")

@@ -12,7 +12,7 @@ from slpi_ros.io.bag_reader import read_bag
 from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.columns import ColumnOptions
 from slpi_ros.io.surroundings import clean, named_in, wild
-from slpi_ros.io.tables import import_table, import_with_summary
+from slpi_ros.io.tables import import_table, import_with_summary, read_table_with
 
 SECOND = 10**9
 START = 1_700_000_000 * SECOND
@@ -172,3 +172,9 @@ def test_columns_named_by_a_topic_are_quantities_of_the_bag_too(tmp_path):
     again = read_bag(tmp_path / "bag")
     for one, other in zip(again.surroundings["/room/temperature"], (t, value), strict=True):
         np.testing.assert_allclose(one, other, rtol=0, atol=1e-9)
+
+
+def test_a_quantity_of_a_command_table_is_held_where_its_cells_are_empty(tmp_path):
+    (tmp_path / "path.csv").write_text("time_s,x_m,/t\n0,1e-6,\n1,2e-6,21\n2,1e-6,\n3,1e-6,22.5\n4,1e-6,\n")
+    _, _, beside = read_table_with(tmp_path / "path.csv", "m", ["/t"])
+    assert beside["/t"].tolist() == [21.0, 21.0, 21.0, 22.5, 22.5]

@@ -35,8 +35,8 @@ def describe_uncertainty(axis: AxisModel, *, details: bool = True) -> list[str]:
     if known:
         (without,) = _at(own, MIDDLE, TIMES["1 s"]).surroundings
         lines.append(
-            f"while {' and '.join(known)} {'is' if len(known) == 1 else 'are'} not known: besides, standard uncertainty "
-            f"{length(float(without))}"
+            f"while {' and '.join(known)} {'is' if len(known) == 1 else 'are'} not known: besides, standard "
+            f"uncertainty {length(float(without))}"
         )
     if not details:
         return lines

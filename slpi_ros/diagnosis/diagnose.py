@@ -181,8 +181,8 @@ def _diagnose_axis(
     before = base.held_out.rms_of_records if fitted else rms_of(runs)
     other_kind = not fitted and before > WRONG_KIND * base.held_out.rms
 
-    def attempt(not_first: Collection[str]) -> _Attempt:
-        found = _selected(base, family if fitted else None, not_first)
+    def attempt(not_first: Collection[str], *, unsure: bool = False) -> _Attempt:
+        found = _selected(base, family if fitted else None, not_first, unsure=unsure)
         if other_kind:
             found = replace(found, structures=(BIAS, *found.structures))
         return _attempt(model, found, runs)
@@ -191,10 +191,10 @@ def _diagnose_axis(
     begun = {effect.name for effect in made.beginnings[:1]}
     named = {one.name for one in made.selection.named}
     imitates = not named or any(EFFECTS[name].free_course for name in named)
-    if begun and imitates and not _explains_all(made.selection) and not one_speed(evidence):
-        # What does not hold, or has a free course, may have been in the way of the causes: these count if they explain
-        # all.
-        again = attempt(begun)
+    if imitates and not _explains_all(made.selection) and not one_speed(evidence):
+        # What does not hold, or has a free course, may have been in the way of the causes, and of several each may hide
+        # the others: these count if they explain all.
+        again = attempt(begun, unsure=not begun)
         if again.selection.named and _explains_all(again.selection):
             made = again
     selection, given, extension = made.selection, made.given, made.extension
@@ -341,12 +341,14 @@ def _not_as_judged(after: Sequence[FreeRun], runs: Sequence[FreeRun], selection:
     return _leaves_more(selection, ABOVE_NOISE)
 
 
-def _selected(base: Explanation, of_family: Evidence | None, not_first: Collection[str]) -> Selection:
+def _selected(
+    base: Explanation, of_family: Evidence | None, not_first: Collection[str], *, unsure: bool = False
+) -> Selection:
     """Return the selection of effects, made with a coarser hysteresis if that is as good, and the joint fit without."""
     evidence, coarse = base.evidence, base.evidence.coarse
     if coarse is not evidence:
         quick = Explanation(coarse, base.effects)
-        selection = _of_kind(quick, of_family.coarse if of_family else None, not_first)
+        selection = _of_kind(quick, of_family.coarse if of_family else None, not_first, unsure=unsure)
         finest = of_family if of_family and BIAS in selection.structures else evidence
         # A smoothness that suits few vertices may leave many without any hold.
         finer = replace(selection.now.evidence, basis=finest.basis, smoothness=evidence.smoothness)
@@ -360,19 +362,25 @@ def _selected(base: Explanation, of_family: Evidence | None, not_first: Collecti
             selection = settled(replace(selection, base=base), start, now)
             if _explains_all(selection):
                 return selection
-    return _of_kind(base, of_family, not_first)
+    return _of_kind(base, of_family, not_first, unsure=unsure)
 
 
-def _of_kind(base: Explanation, of_family: Evidence | None, not_first: Collection[str]) -> Selection:
+def _of_kind(
+    base: Explanation, of_family: Evidence | None, not_first: Collection[str], *, unsure: bool = False
+) -> Selection:
     """Return the selection, with the loop family as hysteresis if clearly better than the kind of `base`."""
     if of_family is None:
-        return select(base, None, not_first)
+        return select(base, None, not_first, unsure=unsure)
     family = Explanation(of_family, base.effects)
     if counts(base.held_out, family.held_out):
-        return select(base, family, not_first)
-    selection = select(base, None, not_first)
+        return select(base, family, not_first, unsure=unsure)
+    selection = select(base, None, not_first, unsure=unsure)
     with_effects = Explanation(of_family, selection.now.effects).refined(2)
-    return select(base, family, not_first) if counts(selection.now.held_out, with_effects.held_out) else selection
+    return (
+        select(base, family, not_first, unsure=unsure)
+        if counts(selection.now.held_out, with_effects.held_out)
+        else selection
+    )
 
 
 def _repeatability(now: Explanation) -> Repeatability:

@@ -92,15 +92,18 @@ class Selection:
         return replace(self, now=now, named=named, dropped=tuple(sorted(dropped)), rivals=left)
 
 
-def select(base: Explanation, family: Explanation | None, not_first: Collection[str] = ()) -> Selection:
+def select(
+    base: Explanation, family: Explanation | None, not_first: Collection[str] = (), *, unsure: bool = False
+) -> Selection:
     """Select effects, beginning with the best one, and with the next if that leaves much and more than the noise.
 
-    Not with an effect in `not_first`, which may be added later.
+    Not with an effect in `not_first`, which may be added later. With `unsure` the first one need not be significant:
+    another one that is not there yet may hide it.
     """
     # `family` is used instead of `base`: the same with the loop family as hysteresis, where that is better. Of two
     # effects a third one may imitate both, and better than either alone. At a single drive frequency nothing tells them
     # apart.
-    best = _grown(base, family, not_first=not_first)
+    best = _grown(base, family, not_first=not_first, unsure=unsure)
     beginnings = best.beginnings
     others = 0 if one_speed(base.evidence) else min(len(beginnings) - 1, FRESH_STARTS)
     for first in range(1, 1 + others):
@@ -144,10 +147,11 @@ def _grown(
     beginnings: tuple[Effect, ...] = (),
     not_first: Collection[str] = (),
     onward: Selection | None = None,
+    unsure: bool = False,
 ) -> Selection:
     """Add effects as long as one has a significant gain, at first that of `beginnings`; remove needless ones.
 
-    With `onward`, to those of that selection.
+    With `onward`, to those of that selection; with `unsure`, begin with the best one, significant or not.
     """
     structures: tuple[str, ...]
     now, structures = (family, (BIAS,)) if family else (base, ())
@@ -171,7 +175,7 @@ def _grown(
             now, structures = with_structure, (*structures, structure)
             continue
         dropped |= {one.name for one in found if counts(now.held_out, one.score) and not one.counts_beside(now)}
-        if not found or not found[0].counts_beside(now):
+        if not found or not (found[0].counts_beside(now) or (unsure and rounds == 1)):
             names = {effect.name for effect in now.effects}
             if not exchanged and len(now.effects) > 1:
                 # The parameters of the rivals have been refined before, too.

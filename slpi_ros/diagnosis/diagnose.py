@@ -278,11 +278,9 @@ def _without_unsure(selection: Selection) -> Selection:
 
 def _is_unsure(named: Named, dropped: Collection[str] = ()) -> bool:
     effect = EFFECTS[named.name]
-    # That two forms of a shift in time are alike makes neither unsure.
-    shifts = {name for name, one in EFFECTS.items() if one.time_shift == effect.time_shift == "only"}
     # What is left of a drift that was dropped looks like creep.
     anything = effect.free_course or effect.follows_quantities
-    return anything or bool({*named.alternatives} - shifts) or effect.resembles_when_old in dropped
+    return anything or bool(named.alternatives) or effect.resembles_when_old in dropped
 
 
 def _leaves_more(selection: Selection, multiple: float) -> bool:

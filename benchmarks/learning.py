@@ -136,6 +136,15 @@ def identified(specimen: Specimen, kept: Path | None) -> slpi_ros.StageModel:
     file = kept / f"{specimen.seed}.json" if kept else None
     if file and file.exists():
         return slpi_ros.load_model(file)
+    records = records_of(specimen)
+    model = slpi_ros.diagnose(records, slpi_ros.identify(records)).extended
+    if file:
+        slpi_ros.save_model(model, file)
+    return model
+
+
+def records_of(specimen: Specimen) -> list[Record]:
+    """Return the records from which a stage is identified."""
     noise, records = np.random.default_rng([7, specimen.seed]), []
     for number, duration in enumerate(RECORDS_S):
         v = calibration_drive(0.0, HIGHEST_V, duration=duration, rate=RATE_HZ, seed=10 * specimen.seed + number)[1]
@@ -143,10 +152,7 @@ def identified(specimen: Specimen, kept: Path | None) -> slpi_ros.StageModel:
         time_ns = np.round((3600.0 * number + np.arange(v.size) / RATE_HZ) * 1e9).astype(np.int64)
         y = x + specimen.noise * noise.standard_normal(x.size)
         records.append(Record(time_ns, {"x": v}, {"x": y}, source=f"record {number + 1}"))
-    model = slpi_ros.diagnose(records, slpi_ros.identify(records)).extended
-    if file:
-        slpi_ros.save_model(model, file)
-    return model
+    return records
 
 
 def path_of(name: str, specimen: Specimen, axis: slpi_ros.AxisModel) -> FloatArray:

@@ -28,6 +28,7 @@ TOPICS = {
     "diagnostics_topic": ("/diagnostics", "topic of the diagnostics"),
     "voltage_trajectory_topic": ("voltage_trajectory", "topic of whole paths, with trajectory_output: block"),
     "trajectory_state_topic": ("voltage_trajectory_state", "topic of what becomes of them"),
+    "recorded_topic": ("recorded_trajectory", "topic of what the device recorded of them"),
 }
 
 

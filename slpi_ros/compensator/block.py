@@ -40,6 +40,11 @@ class Block:
         return times
 
 
+def sampling_period(times_ns: IntArray, period: float) -> float:
+    """Return how far apart (s) the samples of a block are: the output period (s), or the closest points (ns, (N,))."""
+    return min(period, int(np.diff(times_ns).min()) * 1e-9) if times_ns.size > 1 else period
+
+
 def plan(path: Trajectory, axes: Sequence[Axis], stage: StageStream | None, period: float, stamp_ns: int) -> Block:
     """Return the block of voltages for a path; RejectedError if it is too long. The axes, in a block, stay as they are.
 
@@ -47,8 +52,7 @@ def plan(path: Trajectory, axes: Sequence[Axis], stage: StageStream | None, peri
     go to the beginning of the path; the time of the path starts there.
     """
     times = path.time_from_start_ns
-    closest = int(np.diff(times).min()) * 1e-9 if times.size > 1 else period
-    period = min(period, closest)
+    period = sampling_period(times, period)
     moved = [axis for axis in axes if axis.name in path.names]
     grid = np.arange(int(round((times[-1] - times[0]) * 1e-9 / period)) + 1) * period * SECOND_NS + times[0]
     if grid.size > LONGEST:

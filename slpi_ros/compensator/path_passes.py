@@ -5,8 +5,9 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 
 import numpy as np
 
-from slpi_ros.arrays import FloatArray, Mask
+from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.compensator.axis import Axis
+from slpi_ros.compensator.block import Block
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.learning.repeated_paths import FinishedPass, SampledPath
 
@@ -23,6 +24,10 @@ LATE, LATE_PERIODS, RECOVERED, MOST_LATE = 0.01, 5.0, 0.01, 0.1
 HELD_SAMPLES = 3
 # Of more passes in a row than these, the first one is left out.
 FIRST_LEFT_OUT = 2
+# Blocks whose recordings are awaited, and by how much the stamp of a recording may be too early.
+MOST_BLOCKS, EARLY_NS = 4, SECOND_NS // 20
+# A device has played a block if its voltages are those of the block within this share of their range.
+SAME_VOLTAGES = 0.02
 
 
 class PassRecorder:
@@ -33,6 +38,7 @@ class PassRecorder:
         self, path: SampledPath, begin_ns: int, correction: Mapping[str, FloatArray], period: float, learns: bool = True
     ) -> None:
         self.path, self.begin_ns, self.period, self.learns = path, begin_ns, period, learns
+        self.held_back = ""  # why it is not learned from, if that is known before
         self._correction, self._t = path.over_whole(correction), path.t_whole
         self.end_ns = begin_ns + round(float(self._t[-1]) * SECOND_NS)
         self._read: dict[str, tuple[array[float], array[float]]] = {
@@ -61,6 +67,19 @@ class PassRecorder:
                 kept[1].append(axis.voltage)
                 kept[2].append(1 if axis.held else 2 if axis.slewing else 0)
                 axis.tracking.learned = float(self._correction[axis.name][place])
+
+    def recorded(self, names: Sequence[str], at_ns: IntArray, readings: FloatArray, voltages: FloatArray) -> None:
+        """Take what a device has recorded at `at_ns`, (N,): readings (m) and voltages (V), (N, names)."""
+        at = (at_ns - self.begin_ns) * 1e-9
+        begun = np.flatnonzero(at >= 0.0)
+        for column, name in enumerate(names):
+            if name in self._read:
+                self._read[name][0].extend(at[begun].tolist())
+                self._read[name][1].extend(readings[begun, column].tolist())
+            if name in self._output:
+                self._output[name][0].extend(at[begun].tolist())
+                self._output[name][1].extend(voltages[begun, column].tolist())
+                self._output[name][2].extend([0] * begun.size)
 
     def finished(self) -> list[FinishedPass]:
         """Return what each pass says, in order; of several, not the first one, which comes from elsewhere."""
@@ -92,7 +111,9 @@ class PassRecorder:
             voltage[name] = np.interp(t, out_t, out_v)
             within = (out_t >= max(t[0], out_t[begun])) & (out_t <= t[-1])
             held, slow = (int(np.count_nonzero(limited[within] == kind)) for kind in (1, 2))
-            if held >= HELD_SAMPLES:
+            if self.held_back:
+                unusable[name] = self.held_back
+            elif held >= HELD_SAMPLES:
                 unusable[name] = f"the voltage is held at a limit at {held} of its samples"
             elif slow >= HELD_SAMPLES:
                 unusable[name] = f"slew_limit holds the voltage back at {slow} of its samples"
@@ -116,6 +137,8 @@ class PathPasses:
     def __init__(self) -> None:
         self.corrections: dict[str, Mapping[str, FloatArray]] = {}  # m, by identity of the path and axis
         self._recorders: list[PassRecorder] = []
+        self._blocks: list[tuple[Block, PassRecorder]] = []  # whose recordings are awaited
+        self._played: list[PassRecorder] = []
 
     @property
     def on(self) -> bool:
@@ -132,6 +155,29 @@ class PathPasses:
         learns = learns and (now_ns - begin_ns) * 1e-9 <= MOST_LATE * float(path.t_whole[-1])
         correction = self.corrections.get(path.identity, {})
         self._recorders.append(PassRecorder(path, begin_ns, correction, period, learns))
+
+    def begin_block(self, path: SampledPath, block: Block, learns: bool) -> None:
+        """Begin a pass that a device plays by its own clock, and tells by what it has recorded."""
+        correction = self.corrections.get(path.identity, {})
+        recorder = PassRecorder(path, int(block.times_ns[block.lead_in]), correction, block.period, learns)
+        recorder.held_back = block.missed
+        self._blocks = [*self._blocks, (block, recorder)][-MOST_BLOCKS:]
+
+    def recorded(
+        self, stamp_ns: int, names: Sequence[str], times_ns: IntArray, readings: FloatArray, voltages: FloatArray
+    ) -> None:
+        """Take what a device has recorded of a block that began at `stamp_ns`: readings (m), voltages (V), (N, names).
+
+        It is that of the last block before; those before it tell nothing any more.
+        """
+        begun = [number for number, (block, _) in enumerate(self._blocks) if block.stamp_ns <= stamp_ns + EARLY_NS]
+        if not begun:
+            return
+        block, recorder = self._blocks[begun[-1]]
+        del self._blocks[: begun[-1] + 1]
+        if recorder.learns and _played(block, names, times_ns, voltages):
+            recorder.recorded(names, times_ns, readings, voltages)
+            self._played.append(recorder)
 
     def end(self, at_ns: int) -> None:
         """Nothing more is output from `at_ns` on: the passes that have not ended by then tell nothing."""
@@ -153,12 +199,14 @@ class PathPasses:
         """Return what was recorded of the passes that have ended and are to be learned, in order."""
         ended = [one for one in self._recorders if one.end_ns + LAST_READING_NS < now_ns]
         self._recorders = [one for one in self._recorders if one not in ended]
-        return [one for one in ended if one.learns]
+        played, self._played = self._played, []
+        return [*played, *(one for one in ended if one.learns)]
 
     def forget(self) -> None:
         """Begin anew, from the desired paths."""
         self.corrections.clear()
         self._recorders.clear()
+        self._blocks.clear()
 
 
 class ComingAgain:
@@ -184,6 +232,20 @@ class ComingAgain:
                 # Of paths that came once, the readings of the last one only are kept.
                 self._seen = dict.fromkeys([*self._seen][-KNOWN_PATHS:]) | {identity: done}
         return ready
+
+
+def _played(block: Block, names: Sequence[str], times_ns: IntArray, voltages: FloatArray) -> bool:
+    """Return whether a device has played a block: to its end, and with its voltages (V, (N, names))."""
+    if not times_ns.size or times_ns[-1] < block.times_ns[-1] - round(block.period * SECOND_NS):
+        return False
+    for column, name in enumerate(block.names):
+        if name not in names:
+            return False
+        sent = block.voltages[:, column]
+        played = np.interp(block.times_ns, times_ns, voltages[:, list(names).index(name)])
+        if float(np.sqrt(np.mean((played - sent) ** 2))) > SAME_VOLTAGES * float(np.ptp(sent)):
+            return False
+    return True
 
 
 def _at(t: FloatArray, at: FloatArray, readings: FloatArray, interval: float) -> FloatArray:

@@ -41,7 +41,7 @@ class Exact(StreamingMode):
     # It is a weighted sum of input, position and velocity of the zero, a mode that the desired displacement drives.
     def __init__(self, mode: Mode, zero: Mode) -> None:
         super().__init__(zero)
-        self._zero = zero
+        self.zero = zero
         high = (zero.omega / mode.omega) ** 2
         self._weights, self._late = (high, 1 - high, mode.lag - high * zero.lag), mode.lag - zero.lag
         self._longest = WIDEST / zero.omega
@@ -49,7 +49,7 @@ class Exact(StreamingMode):
     @property
     def law(self) -> tuple[float, ...]:
         """Numbers for the compiled inverse: 0, the zero's frequency and damping, weights, delay and longest step."""
-        return 0.0, self._zero.omega, self._zero.damping, *self._weights, self._late, self._longest
+        return 0.0, self.zero.omega, self.zero.damping, *self._weights, self._late, self._longest
 
     def inverse(self, dt: float, wanted: float) -> float:
         """Return the input (m) for `wanted` (m) after `dt` (s); keep the state."""
@@ -299,6 +299,10 @@ class Resonance(EffectBase):
             for mode, zero in zip_longest(ordered, zeros(ordered, self.rest))
         ]
         return sorted(found, key=lambda factor: isinstance(factor, Exact))
+
+    def inverse_modes(self) -> list[Mode]:
+        """Return the modes of the inverse itself: the zeros of the factors that are inverted exactly."""
+        return [factor.zero for factor in self.factors() if isinstance(factor, Exact)]
 
     @classmethod
     def fit(cls, context: ResidualContext) -> Iterator[Candidate]:

@@ -10,17 +10,20 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import ModelError, length
-from slpi_ros.learning.first_guess import first_guess, ringing
-from slpi_ros.learning.harmonics import TEST_ABOVE, ComplexArray, Harmonics
-from slpi_ros.learning.passes import Judged, agreed, judge
+from slpi_ros.learning.dynamics import Dynamics, Pass
+from slpi_ros.learning.first_guess import first_guess, known_modes, ringing
+from slpi_ros.learning.harmonics import ComplexArray, Harmonics
+from slpi_ros.learning.passes import Judged, agreed, held_back, judge
+from slpi_ros.learning.spectrum import PathSpectrum
 from slpi_ros.model.axis_model import AxisModel
 
 # Gain of a step towards the desired path, at first.
 GAIN = 0.6
 # What keeps the error where it is, as long as passes still make it smaller.
 NOT_YET = "not yet learned"
-# A pass is worse than the best from this ratio of their errors on, beyond this many standard deviations of the noise.
-WORSE, WORSE_BY_NOISE = 1.1, 4.0
+# A pass is worse than the best from this ratio of their errors on, beyond this many standard deviations of the noise
+# and of what is transient.
+WORSE, WORSE_BY_NOISE, UNSURE = 1.1, 4.0, 3.0
 # Times that learning goes back to the best pass without a better one since, and passes in a row that cannot be learned
 # from, until it is held.
 MOST_RETURNS, MOST_REFUSED = 2, 3
@@ -30,31 +33,30 @@ HELD = "held"
 BEST_PASSES = 50
 # Largest part of the stroke that learning may add to the desired path, by default.
 LIMIT_SHARE = 0.25
-# A path closes if its ends differ by less than this many of its largest steps; otherwise it is led back to its
-# beginning over this share of it, and the correction begins and ends at 0, over this share.
-CLOSING_STEPS, LED_BACK, TAPER = 1.5, 0.25, 0.02
-# Samples in a row at a voltage limit that count as held there, and share of the range by which it is reached.
-HELD_SAMPLES, AT_LIMIT = 3, 1e-6
 # Readings further from the path than this many strokes are none.
 FAR = 10.0
 # Hashes of passes that are kept to find a replayed one, and passes whose figures are kept.
 KEPT_HASHES, KEPT_PASSES = 64, 10_000
+# Passes that the dynamics are estimated from, the last ones, and most samples of them.
+HISTORY, HISTORY_SAMPLES = 12, 60_000
 # Largest answer to a change of the path that is still taken for one, as a multiple of the change.
 ANSWER = 5.0
-# A change has settled where a pass differs from the one before by this share of what it has changed; most passes that
-# are waited for. Before that, a pass that is so much worse than the best leads back at once.
-SETTLED, MOST_DWELL, AT_ONCE = 0.2, 6, 1.5
-# What settles within the passes that are waited for falls to less than this share, in power, from each to the next.
-FALLING = 0.7
 # A change of a path that closes comes in without a jump, which an identified mode would answer to: over this many of
 # its periods, and at most this share of the pass.
 ONSET_PERIODS, ONSET = 5.0, 0.25
-# A mode has its part in the harmonics within this share of its frequency.
-BAND = 0.2
 # A path that is followed is the one asked for within this (m).
 SAME_PATH = 1e-13
 # A harmonic's error counts beyond this many standard deviations.
 CLEAR = 2.0
+# Passes after the first two in which what does not settle at once may still be large.
+SETTLING = 3
+# The best path once more has not settled as long as a pass has less than this share of the mean square error of the one
+# before; most passes that are waited for.
+FALLING, MOST_SETTLING = 0.85, 6
+# Passes after the best one in which what is calculated to be transient excuses a larger error.
+EXCUSED = 4
+# Share of a larger error that the answer to what was changed has at least, if it is to be blamed.
+BLAMED = 0.5
 
 
 @dataclass(frozen=True)
@@ -84,6 +86,7 @@ class _Best:
     number: int
     power: float  # m^2, mean square error
     correction: FloatArray
+    reading: FloatArray  # m, (N,), without offset and drift
 
 
 class AxisLearner:
@@ -95,15 +98,8 @@ class AxisLearner:
         self.axis, self.dt, self.desired, self.voltage = axis, dt, desired, voltage
         low, high = axis.displacement_range
         self.limit = LIMIT_SHARE * (high - low) if limit is None else limit
-        steps = np.abs(np.diff(desired))
-        self.closed = bool(abs(desired[0] - desired[-1]) <= CLOSING_STEPS * float(steps.max(initial=0.0)))
-        self.taper = np.ones(desired.size)
-        if not self.closed:
-            edge = max(2, int(TAPER * desired.size))
-            rise = 0.5 - 0.5 * np.cos(np.pi * np.arange(edge) / edge)
-            self.taper[:edge], self.taper[-edge:] = rise, rise[::-1]
-        self.wanted = self._spectrum(desired)
-        self.frequency: FloatArray = np.asarray(np.fft.rfftfreq(self._size, dt), dtype=np.float64)
+        self.spectrum = PathSpectrum(desired, dt)
+        self.wanted, self.frequency = self.spectrum.of(desired), self.spectrum.frequency
         self.correction = np.zeros(desired.size)
         self.passes: list[PassReport] = []
         self.gain, self.held, self.returns, self.refused = GAIN, "", 0, 0
@@ -112,42 +108,29 @@ class AxisLearner:
         self._deviating: Mask | None = None
         self._last = np.zeros(desired.size)  # correction of the pass before that was learned from
         self._before = np.zeros(desired.size)  # correction at the end of the pass before
-        self._aimed = self._before  # what the correction became in the last pass that was learned from
         self._offset: float | None = None
         self._hashes: list[str] = []
         self._clipped = self._told = ""
-        # Readings (m) of the pass before, and of that before the last change of the path; passes since, and how many it
-        # takes until they have settled.
-        self._previous: FloatArray | None = None
-        self._changed: FloatArray | None = None
-        self._since = 0
-        self._dwell: int | None = None
-        self._moved = math.inf  # m^2, mean square difference of the last two passes
-        # Harmonics near an identified mode that rings from pass to pass, passes until it has settled, and passes since
-        # these harmonics were changed: the first pass comes from rest.
-        self._ringing = np.zeros(self.frequency.size, dtype=np.bool_)
-        self._ring_dwell, self._ring_since = 1, 0
-        slowest = 0.0
-        for hertz, seconds in ringing(axis):
-            slowest = max(slowest, ONSET_PERIODS / hertz)
-            passes = _passes_until_settled(self._size * dt, seconds)
-            if passes > 1:
-                self._ringing |= np.abs(self.frequency - hertz) < BAND * hertz
-                self._ring_dwell = max(self._ring_dwell, passes)
+        slowest = max((ONSET_PERIODS / hertz for hertz, _ in ringing(axis)), default=0.0)
         rising = max(1.0, min(ONSET * desired.size, slowest / dt))
         self._onset = 0.5 - 0.5 * np.cos(np.pi * np.minimum((np.arange(desired.size) + (rising == 1.0)) / rising, 1.0))
         self._lead_in: FloatArray | None = None
-        self._returned = False  # the next pass is that of the best path again
-        noise = np.full(self.frequency.size, self._size * max(axis.quality.floor_rms, 1e-12) ** 2)
-        guess, variance = first_guess(axis, dt, self.frequency)
-        self._guess = Harmonics.first(guess, variance, noise)
-        self.harmonics = self._guess
+        self._returned = 0  # passes of the best path again, until it has settled
+        self._settling = math.inf  # m^2, mean square error of the pass before
+        self._history: list[Pass] = []
+        self._undisturbed: Pass | None = None  # the second pass, from which on the path is changed
+        noise = np.full(self.frequency.size, self.spectrum.size * max(axis.quality.floor_rms, 1e-12) ** 2)
+        self.harmonics = Harmonics.first(*first_guess(axis, dt, self.frequency), noise)
+        self.dynamics = Dynamics(
+            self.spectrum.size, dt, self.spectrum.closed,
+            lambda frequency: first_guess(axis, dt, frequency), known_modes(axis, dt),
+        )  # fmt: skip
 
     @property
     def path(self) -> FloatArray:
         """The desired path of the next pass, (N,), metres: a change of `aim` comes in without a jump."""
         correction = self.correction
-        if self.closed:
+        if self.spectrum.closed:
             correction = self._before + self._onset * (correction - self._before)
         return self._within_range(correction)
 
@@ -162,14 +145,9 @@ class AxisLearner:
         return np.asarray(np.clip(self.desired + correction, low, high))
 
     @property
-    def _still(self) -> bool:
-        """Whether the modes have settled since their harmonics were changed."""
-        return self._ring_since >= self._ring_dwell
-
-    @property
     def noise(self) -> float:
         """Standard deviation of one reading from pass to pass, metres."""
-        return math.sqrt(self._power(self.harmonics.noise))
+        return math.sqrt(self.spectrum.power(self.harmonics.noise))
 
     def update(
         self,
@@ -186,7 +164,6 @@ class AxisLearner:
             self.correction = self._before = followed - self.desired
         commanded = self.path - self.desired
         self._before = self.correction
-        self._ring_since += 1
         seen = (
             self.axis.correct(np.arange(measured.size, dtype=np.float64) * self.dt, measured)
             if self.axis.corrects
@@ -195,30 +172,23 @@ class AxisLearner:
         low, high = self.axis.displacement_range
         seen = np.where(np.abs(seen - self.desired) <= FAR * (high - low), seen, np.nan)
         first = not self.harmonics.passes
-        correction = self._spectrum(commanded)
-        expected = self.desired if first else self._signal(self.harmonics.expected(correction))
-        floor = math.sqrt(self._power(np.full(self.frequency.size, self.harmonics.noise.min())))
-        change = self._spectrum(commanded - self._last)
-        own = ANSWER**2 * self._power(np.abs(change) ** 2)
-        power = own + self._power(self.harmonics.variance(correction) + self.harmonics.noise) if not first else math.inf
+        expected, spread = self._expected(commanded)
+        floor = math.sqrt(self.spectrum.power(np.full(self.frequency.size, self.harmonics.noise.min())))
         error = next((one.error for one in reversed(self.passes) if one.learned), math.inf)
-        if self._previous is not None and not change.any():
-            # The same path again: the same reading, but for what is still settling.
-            expected, power = self._previous, 2.0 * self.noise**2
-            if not self._still or self._dwell is None or self._since < self._dwell:
-                # What is settling, and a mode that begins to ring, may change as much as the error.
-                power += error**2
-        judged = judge(seen, expected, math.sqrt(power), floor, self._deviating, error)
+        judged = judge(seen, expected, spread, floor, self._deviating, error)
         if self._lead_in is not None and not judged.reason:
             judged = agreed(self._lead_in, judged, self.desired, floor)
-        reason = unusable or self._replayed(measured) or judged.reason or self._held_back(voltage)
+        reason = unusable or self._replayed(measured) or judged.reason
+        if not reason and voltage is not None and (reason := held_back(voltage, self.voltage)):
+            self._clipped = "voltage range"
         offset, drift = self._offset_and_drift(judged, expected, first=first)
         clean = judged.measured - offset - drift * (np.arange(measured.size) / measured.size - 0.5)
         rest = (clean - self.desired)[np.isfinite(clean)]
         whole = (seen - self.desired)[np.isfinite(seen)]
         rms, absolute = (float(np.sqrt(np.mean(x**2))) if x.size else 0.0 for x in (rest, whole))
+        self._remember(commanded, None if reason else clean)
         if reason:
-            self._refuse(reason, new=bool(change.any()))
+            self._refuse(reason, new=bool((commanded != self._last).any()))
         else:
             self._learn(commanded, clean, judged, rms)
             self._offset = offset
@@ -230,6 +200,30 @@ class AxisLearner:
         del self.passes[:-KEPT_PASSES]
         return report
 
+    def _expected(self, commanded: FloatArray) -> tuple[FloatArray, float]:
+        """Return the expected reading (m, (N,)) of a pass, and its standard deviation (m)."""
+        harmonics, power = self.harmonics, self.spectrum.power
+        if not harmonics.passes:
+            return self.desired, math.inf
+        whole, correction = self.spectrum.whole, self.spectrum.of(self.correction)
+        following = [*self._history, Pass(whole(commanded), None)]
+        transient = self.dynamics.transient(following, whole(self.correction))
+        change = np.abs(self.spectrum.of(commanded - self._last)) ** 2
+        spread = power(harmonics.variance(correction) + harmonics.noise) + ANSWER**2 * power(change)
+        # What is transient is expected with a doubt of its own size; and the first passes have not settled.
+        spread += power(np.abs(transient) ** 2)
+        if harmonics.passes <= SETTLING or self._returned:
+            spread += next((one.error for one in reversed(self.passes) if one.learned), 0.0) ** 2
+        return self.spectrum.signal(harmonics.expected(correction) + transient), math.sqrt(spread)
+
+    def _remember(self, commanded: FloatArray, clean: FloatArray | None) -> None:
+        whole = self.spectrum.whole
+        self._history.append(Pass(whole(commanded), None if clean is None else whole(clean)))
+        kept = max(2, min(HISTORY, HISTORY_SAMPLES // self.spectrum.size))
+        if len(self._history) > kept:
+            self._history.pop(0)
+            self.dynamics.forget_oldest()
+
     def _learn(self, commanded: FloatArray, clean: FloatArray, judged: Judged, rms: float) -> None:
         self._told, self.refused = "", 0
         if self._lead_in is None and not self.passes:
@@ -237,87 +231,114 @@ class AxisLearner:
             self._lead_in, self._deviating = clean, judged.deviating
             self._told = "the first pass: compared with the next"
             return
-        lead_in, self._lead_in = self._lead_in, None
-        settled = self._settled(clean)
-        self._deviating, self._last, self._aimed = judged.deviating, commanded, self.correction
-        if not settled and not (self.best and rms**2 > AT_ONCE**2 * self.best.power + self._scatter()):
-            self._told = "its changes are still settling"
-            return
-        h, seen, correction = self.harmonics, self._spectrum(clean), self._spectrum(commanded)
-        if h.passes:
-            self.harmonics = h.after(correction, seen, self._due)
-        else:
-            self.harmonics = h.begun(
-                self.wanted + correction, seen, seen if lead_in is None else self._spectrum(lead_in)
-            )
-        number, best = len(self.passes) + 1, self.best
-        if best is not None and number - best.number > BEST_PASSES:
-            best = None
-        again = best is not None and self._returned
-        self._returned = False
-        if best is not None and again:
-            # The best path once more: its error was lucky, or what has come between is still settling.
-            self.best = replace(best, power=max(best.power, 0.5 * (best.power + rms**2)))
-        elif self._still and (best is None or rms**2 < best.power):
-            if rms**2 < self.record - self._scatter():
-                self.returns = 0
-            self.record = min(self.record, rms**2)
-            self.best = _Best(number, rms**2, self.correction)
-        elif best and rms**2 > (WORSE if self._still else AT_ONCE) ** 2 * best.power + self._scatter():
-            self._return(f"worse than pass {best.number}: {length(rms)} after {length(math.sqrt(best.power))}")
-            return
-        if self.held:
-            return
-        if not self._still and self._testing:
-            self._told = "its changes are still settling"
-        else:
+        self._lead_in = None
+        self._deviating, self._last = judged.deviating, commanded
+        steady, unsure = self._estimate(clean)
+        if self._worth_a_step(clean, rms, steady, unsure) and not self.held:
             self._step()
 
-    @property
-    def _due(self) -> Mask:
-        """Harmonics, (K,), that are learned from this pass: those of a mode only when it has settled."""
-        return ~self._ringing | self._still
+    def _worth_a_step(self, clean: FloatArray, rms: float, steady: float, unsure: float) -> bool:
+        """Judge a pass against the best one; return whether a step may follow.
 
-    @property
-    def _testing(self) -> bool:
-        """Whether the gain of a mode is not known yet: nothing else is changed while it answers to a test."""
-        h, unknown = self.harmonics, self._ringing & ~self.harmonics.phase_known
-        error = np.abs(self.left) > TEST_ABOVE * np.sqrt(h.variance(self._spectrum(self.correction)))
-        return bool((unknown & error).any())
-
-    def _settled(self, clean: FloatArray) -> bool:
-        """Return whether the answer to the last change of the path has settled: a lightly damped mode rings for passes.
-
-        The first change of the path is followed until a pass is like the one before; later ones as many passes.
+        `rms` (m) is its error, `steady` (m^2) its mean square error without what is transient, and `unsure` (m^2) the
+        mean variance of that. What is transient may be wrong: a better pass has to be so with it and without it.
         """
-        if (self.correction != self._aimed).any():
-            self._since, self._changed, self._moved = 0, self._previous, math.inf
-        self._since, before = self._since + 1, self._previous
-        self._previous = clean
-        if self._changed is None or before is None:
+        number, power, best = len(self.passes) + 1, max(steady, rms**2), self.best
+        if best is not None and number - best.number > BEST_PASSES:
+            best = None
+        if best is not None and self._returned:
+            return self._settled_again(best, clean, rms**2)
+        self._returned = 0
+        if best is None or power < best.power:
+            if power < self.record - self._scatter():
+                self.returns = 0
+            self.record = min(self.record, power)
+            self.best = _Best(number, power, self.correction, clean)
             return True
-        if self._since > 1 and self._dwell is None:
-            moved, answered = (
-                self._power(np.abs(self._spectrum(clean - other)) ** 2 * ~self._ringing)
-                for other in (before, self._changed)
-            )
-            settled = moved < max(SETTLED**2 * answered, 4.0 * self.noise**2) or self._since > MOST_DWELL
-            # What differs as much as between the passes before does not settle: it does not repeat.
-            if settled or moved > FALLING * self._moved:
-                self._dwell = self._since - 1
-            self._moved = moved
-        return self._dwell is not None and self._since >= self._dwell
+        least = min(steady, rms**2) if number - best.number <= EXCUSED else rms**2
+        harmful = rms**2 > self._harm + self._scatter()
+        if not harmful and least <= self._much_worse(best.power, unsure):
+            return True
+        if not harmful and not self._may_be_of_changes(rms - math.sqrt(best.power)):
+            # The stage has changed by itself.
+            self.best = _Best(number, power, self.correction, clean)
+            return True
+        if self.held and harmful:
+            self._give_up()
+        else:
+            self._return(f"worse than pass {best.number}: {length(rms)} after {length(math.sqrt(best.power))}", rms)
+        return False
+
+    def _settled_again(self, best: _Best, clean: FloatArray, power: float) -> bool:
+        """Judge the best path once more: its error was lucky, or what has come between is still settling."""
+        falling, self._settling = power < FALLING * self._settling, power
+        self._returned += 1
+        if falling and self._returned <= MOST_SETTLING:
+            self._told = "its changes are still settling"
+            return False
+        self._returned = 0
+        self.best = replace(best, power=power, reading=clean)
+        if power > self._harm + self._scatter():
+            self._give_up()
+            return False
+        return True
+
+    def _give_up(self) -> None:
+        """Follow the path as it was at first: nothing that was learned is better."""
+        self.correction, self.best = self._start, None
+
+    def _may_be_of_changes(self, more: float) -> bool:
+        """Return whether what was changed since the best pass may have made the error larger by so much (m)."""
+        assert self.best is not None
+        change = np.abs(self.spectrum.of(self.correction - self.best.correction))
+        largest = np.abs(self.harmonics.gain) + np.sqrt(self.harmonics.gain_variance)
+        return math.sqrt(self.spectrum.power((largest * change) ** 2)) > BLAMED * more
+
+    def _much_worse(self, power: float, unsure: float) -> float:
+        """Return the mean square error (m^2) from which on a pass is worse than one with an error of `power` (m^2)."""
+        return (WORSE * math.sqrt(power) + UNSURE * math.sqrt(unsure)) ** 2 + self._scatter()
+
+    @property
+    def _start(self) -> FloatArray:
+        """Correction (m, (N,)) before anything was learned."""
+        return (
+            np.zeros(self.desired.size)
+            if self._undisturbed is None
+            else self._undisturbed.commanded[: self.desired.size]
+        )
+
+    @property
+    def _harm(self) -> float:
+        """Mean square error (m^2) of a pass from which on it is worse than the first ones were."""
+        return max((WORSE * one.error for one in self.passes[:2] if one.learned), default=math.inf) ** 2
+
+    def _estimate(self, clean: FloatArray) -> tuple[float, float]:
+        """Learn the dynamics and the harmonics from a pass.
+
+        Return its mean square error without what is transient, and the mean variance of that (m^2).
+        """
+        h, seen, correction = self.harmonics, self.spectrum.of(clean), self.spectrum.of(self.correction)
+        if self._undisturbed is None:
+            self._undisturbed = self._history[-1]
+        begun = self._undisturbed
+        path = self.wanted + np.fft.rfft(begun.commanded)
+        rest = h.of_hysteresis(path)
+        answer = self.dynamics.answer(
+            self._history, self.spectrum.whole(self.correction), begun, path, rest, h.noise, h.of_hysteresis
+        )
+        settled = seen - answer.transient
+        self.harmonics = h.after(correction, settled, answer) if h.passes else h.begun(correction, settled, answer)
+        power = self.spectrum.power
+        return power(np.abs(self.wanted - settled) ** 2), power(answer.transient_variance)
 
     def _step(self) -> None:
-        harmonics = self.harmonics.step(self._spectrum(self.correction), self.wanted, self.gain) * self._due
+        harmonics = self.harmonics.step(self.spectrum.of(self.correction), self.wanted, self.gain)
         error = np.abs(self.left) ** 2
-        taken = self._power(error - np.abs(self.left - self.harmonics.gain * harmonics) ** 2)
-        added = self._power(self.harmonics.scatter * float(np.mean(np.abs(harmonics[1:]) ** 2)))
+        power = self.spectrum.power
+        taken = power(error - np.abs(self.left - self.harmonics.gain * harmonics) ** 2)
+        added = power(self.harmonics.scatter * float(np.mean(np.abs(harmonics[1:]) ** 2)))
         harmonics = harmonics * (taken / max(taken + added, 1e-300) if taken > 0.0 else 1.0)
-        if harmonics[self._ringing].any():
-            self._ring_since = 0
-        step = self._signal(harmonics) * self.taper
-        wanted = self.correction + step
+        wanted = self.correction + self.spectrum.signal(harmonics) * self.spectrum.taper
         allowed = np.clip(wanted, -self.limit, self.limit)
         low, high = self.axis.displacement_range
         inside = np.clip(self.desired + allowed, min(low, self.desired.min()), max(high, self.desired.max()))
@@ -326,14 +347,13 @@ class AxisLearner:
         self._clipped = "learn_limit" if (allowed != wanted).any() else "voltage range" if beyond.any() else ""
         self.correction = reached
 
-    def _return(self, why: str) -> None:
+    def _return(self, why: str, rms: float) -> None:
         """Go back to the best pass with half the gain; the second time without a better one since, hold."""
         assert self.best is not None
         self.correction, self.gain, self.returns = self.best.correction, 0.5 * self.gain, self.returns + 1
-        # What was learned from passes that had not settled may be wrong: the gains are learned anew, and how long it
-        # takes to settle.
-        self._returned, self._dwell, self._ring_since = True, None, 0
-        self.harmonics = self.harmonics.doubted(self._guess)
+        self._returned, self._settling = 1, rms**2
+        # What was learned of the last pass is not to make a riddle of the next one.
+        self.harmonics = self.harmonics.at(self.spectrum.of(self.best.correction), self.spectrum.of(self.best.reading))
         self._told = f"{why}; back to the best, at half the gain"
         if self.returns >= MOST_RETURNS:
             self.held = f"{HELD}: {why}, for the second time"
@@ -343,7 +363,7 @@ class AxisLearner:
         self._told = reason
         self.refused += 1
         if self.best is not None and (new or self.refused >= MOST_REFUSED):
-            self.correction, self._returned, self._ring_since = self.best.correction, True, 0
+            self.correction, self._returned, self._settling = self.best.correction, 1, math.inf
         if self.refused >= MOST_REFUSED:
             self.held = f"{HELD}: {MOST_REFUSED} passes in a row were not learned from, the last as {reason}"
 
@@ -352,10 +372,10 @@ class AxisLearner:
         if self._clipped:
             return self._clipped
         left, harmonics = self.left, self.harmonics
-        sure = np.abs(left) ** 2 > CLEAR**2 * (harmonics.variance(self._spectrum(self.correction)) + harmonics.noise)
+        sure = np.abs(left) ** 2 > CLEAR**2 * (harmonics.variance(self.spectrum.of(self.correction)) + harmonics.noise)
         known = harmonics.phase_known
         power = np.abs(left) ** 2
-        learnable, beyond = self._power(power * (sure & known)), self._power(power * (sure & ~known))
+        learnable, beyond = self.spectrum.power(power * (sure & known)), self.spectrum.power(power * (sure & ~known))
         if max(learnable, beyond) < self.noise**2:
             return "drift" if abs(drift) > self.noise else "noise"
         return "bandwidth" if beyond > learnable else NOT_YET
@@ -363,7 +383,7 @@ class AxisLearner:
     @property
     def left(self) -> ComplexArray:
         """Expected error of the next pass by harmonic, (K,), metres (as `numpy.fft.rfft`), without the mean."""
-        left = self.wanted - self.harmonics.expected(self._spectrum(self.correction))
+        left = self.wanted - self.harmonics.expected(self.spectrum.of(self.correction))
         left[0] = 0.0
         return np.asarray(left)
 
@@ -376,28 +396,6 @@ class AxisLearner:
     def forget(self) -> None:
         """Begin anew from the desired path."""
         self.__init__(self.axis, self.dt, self.desired, self.limit, self.voltage)  # type: ignore[misc]
-
-    @property
-    def _size(self) -> int:
-        return self.desired.size + (0 if self.closed else max(16, int(LED_BACK * self.desired.size)))
-
-    def _spectrum(self, x: FloatArray) -> ComplexArray:
-        """Return the harmonics of a signal (m, (N,)), led back to its beginning if the path does not close."""
-        count = self._size - x.size
-        if count:
-            share = 0.5 - 0.5 * np.cos(np.pi * (np.arange(count) + 1.0) / (count + 1.0))
-            x = np.concatenate([x, x[-1] + (x[0] - x[-1]) * share])
-        return np.asarray(np.fft.rfft(x))
-
-    def _signal(self, spectrum: ComplexArray) -> FloatArray:
-        return np.asarray(np.fft.irfft(spectrum, self._size)[: self.desired.size])
-
-    def _power(self, power: FloatArray) -> float:
-        """Return the mean square (m^2) of a signal with these squares of harmonics (m^2, (K,)), without the mean."""
-        twice = np.full(power.size, 2.0)
-        if self._size % 2 == 0:
-            twice[-1] = 1.0
-        return float((twice * power)[1:].sum()) / self._size**2
 
     def _scatter(self) -> float:
         """Return by how much (m^2) the mean square error of a pass may differ by its noise."""
@@ -431,18 +429,6 @@ class AxisLearner:
             return "every reading is that of an earlier pass: the sensor's data are replayed"
         return ""
 
-    def _held_back(self, voltage: FloatArray | None) -> str:
-        """Return that a limit held the voltage back; "" if none did, or the voltage is not known."""
-        if voltage is None:
-            return ""
-        (low, high), margin = self.voltage, AT_LIMIT * (self.voltage[1] - self.voltage[0])
-        at = (voltage <= low + margin) | (voltage >= high - margin)
-        runs = np.convolve(at, np.ones(HELD_SAMPLES), "valid") >= HELD_SAMPLES - 0.5
-        if not runs.any():
-            return ""
-        self._clipped = "voltage range"
-        return f"the voltage is held at a limit at {int(np.count_nonzero(at))} of its samples"
-
     def to_document(self) -> dict[str, Any]:
         """Return what was learned as a part of a document, metres and seconds."""
         h = self.harmonics
@@ -450,14 +436,12 @@ class AxisLearner:
             "desired_m": self.desired.tolist(),
             "correction_m": self.correction.tolist(),
             "last_correction_m": self._last.tolist(),
-            "previous_m": _listed(self._previous),
-            "changed_m": _listed(self._changed),
             "lead_in_m": _listed(self._lead_in),
-            "since": self._since,
-            "ring_since": self._ring_since,
-            "dwell": self._dwell,
-            "moved_m2": self._moved if math.isfinite(self._moved) else None,
+            "undisturbed": self._undisturbed and self._undisturbed.to_document(),
+            "history": [one.to_document() for one in self._history],
+            "dynamics": self.dynamics.to_document(),
             "returned": self._returned,
+            "settling_m2": self._settling if math.isfinite(self._settling) else None,
             "record_m2": self.record if math.isfinite(self.record) else None,
             "learn_limit_m": self.limit,
             "gain": self.gain,
@@ -471,6 +455,7 @@ class AxisLearner:
                 "number": self.best.number,
                 "power_m2": self.best.power,
                 "correction_m": self.best.correction.tolist(),
+                "reading_m": self.best.reading.tolist(),
             },
             "hashes": self._hashes,
             "harmonics": {
@@ -482,6 +467,9 @@ class AxisLearner:
                 "noise_m2": h.noise.tolist(),
                 "answered_m": _pairs(h.answered),
                 "scatter": h.scatter.tolist(),
+                "misfit": h.misfit.tolist(),
+                "changed": h.changed.tolist(),
+                "answers": _pairs(h.answers),
                 "passes": h.passes,
             },
             "passes": [asdict(one) for one in self.passes],
@@ -493,18 +481,18 @@ class AxisLearner:
         if correction.shape != self.desired.shape:
             raise ModelError(f"{correction.size} corrections for a path of {self.desired.size} samples; learn it anew")
         low, high = -self.limit, self.limit
-        self.correction = self._last = self._before = self._aimed = np.clip(correction, low, high)
+        self.correction = self._last = self._before = np.clip(correction, low, high)
         if not same_model:
             return
         numbers, h = document["harmonics"], self.harmonics
         if len(numbers["noise_m2"]) != h.noise.size:
             raise ModelError(f"{len(numbers['noise_m2'])} harmonics, not {h.noise.size}; learn the path anew")
-        self._last = self._aimed = np.array(document["last_correction_m"])
-        self._previous, self._changed = _array(document["previous_m"]), _array(document["changed_m"])
-        self._lead_in, self._since = _array(document["lead_in_m"]), document["since"]
-        self._ring_since = document["ring_since"]
-        self._dwell, self._returned = document["dwell"], document["returned"]
-        self._moved = math.inf if document["moved_m2"] is None else document["moved_m2"]
+        self._last, self._lead_in = np.array(document["last_correction_m"]), _array(document["lead_in_m"])
+        self._history = [Pass.of(one) for one in document["history"]]
+        self._undisturbed = document["undisturbed"] and Pass.of(document["undisturbed"])
+        self.dynamics.resume(document["dynamics"])
+        self._returned = document["returned"]
+        self._settling = math.inf if document["settling_m2"] is None else document["settling_m2"]
         self.record = math.inf if document["record_m2"] is None else document["record_m2"]
         self.gain, self.held = document["gain"], document["held"]
         self.returns, self.refused, self._offset = document["returns"], document["refused"], document["offset_m"]
@@ -512,7 +500,9 @@ class AxisLearner:
             self._deviating = np.zeros(self.desired.size, dtype=np.bool_)
             self._deviating[np.array(document["deviating"], dtype=np.intp)] = True
         if best := document["best"]:
-            self.best = _Best(best["number"], best["power_m2"], np.array(best["correction_m"]))
+            self.best = _Best(
+                best["number"], best["power_m2"], np.array(best["correction_m"]), np.array(best["reading_m"])
+            )
         self._hashes = list(document["hashes"])
         self.passes = [PassReport(**one) for one in document["passes"]]
         self.harmonics = replace(
@@ -525,18 +515,11 @@ class AxisLearner:
             noise=np.array(numbers["noise_m2"]),
             answered=_complex(numbers["answered_m"]),
             scatter=np.array(numbers["scatter"]),
+            misfit=np.array(numbers["misfit"]),
+            changed=np.array(numbers["changed"]),
+            answers=_complex(numbers["answers"]),
             passes=numbers["passes"],
         )
-
-
-def _passes_until_settled(duration: float, ringing: float) -> int:
-    """Return from which pass (`duration`, s) after a change on a mode that rings (s) has settled to `SETTLED`."""
-    if ringing <= 0.0:
-        return 1
-    share = duration / ringing
-    # Mean of the decay over the first pass; each further one is less by exp(-share).
-    first = -math.expm1(-share) / share
-    return min(1 + max(math.ceil(math.log(first / SETTLED) / share), 0), MOST_DWELL)
 
 
 def _listed(x: FloatArray | None) -> list[float] | None:

@@ -10,6 +10,7 @@ from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import Effect
 from slpi_ros.errors import SlpiError
 from slpi_ros.learning.harmonics import ComplexArray
+from slpi_ros.learning.modes import Mode
 from slpi_ros.model.axis_model import AxisModel
 
 # Relative standard deviation of a gain at low frequencies. It grows with the square of the frequency, by 1 at that of a
@@ -24,6 +25,8 @@ SAMPLES, REPEATED, AMPLITUDE = 2048, 3, 1e-3
 # Frequency (Hz) from which the test signal falls with the square of the frequency, as paths do: the inverse of a mode
 # makes voltages of high frequencies so large that hysteresis answers to them at all others.
 FALLING_HZ = 100.0
+# Largest frequency (rad/sample) of a mode that samples of the path show.
+HIGHEST_ANGLE = 2.8
 
 
 def first_guess(axis: AxisModel, dt: float, frequency: FloatArray) -> tuple[ComplexArray, FloatArray]:
@@ -66,6 +69,16 @@ def ringing(axis: AxisModel) -> list[tuple[float, float]]:
     """Return frequency (Hz) of each identified mode, and the time (s) in which it falls by the factor e."""
     modes = [mode for effect in axis.stage_only.effects for mode in getattr(effect, "modes", ())]
     return [(mode.frequency, 1.0 / (2.0 * math.pi * mode.frequency * mode.damping)) for mode in modes]
+
+
+def known_modes(axis: AxisModel, dt: float) -> list[Mode]:
+    """Return the modes that ring behind the inverse, sampled at `dt` (s): identified ones, and those of the inverse."""
+    found: list[Mode] = []
+    for effect in axis.stage_only.effects:
+        found += [Mode.of(mode.frequency, mode.damping, dt) for mode in getattr(effect, "modes", ())]
+        own = effect.inverse_modes() if hasattr(effect, "inverse_modes") else ()
+        found += [Mode.of(zero.frequency, zero.damping, dt, exact=True) for zero in own]
+    return [mode for mode in found if mode.angle < HIGHEST_ANGLE]
 
 
 class _Test:

@@ -1,4 +1,4 @@
-"""Gain and repeating error of each harmonic of a path that repeats, estimated from its passes by a Kalman filter."""
+"""Repeating error of each harmonic of a path that repeats, by a Kalman filter, and the step that corrects it."""
 
 from dataclasses import dataclass, replace
 
@@ -9,34 +9,60 @@ from slpi_ros.arrays import FloatArray, Mask
 
 ComplexArray = NDArray[np.complex128]
 
-# A phase counts as known where two standard deviations of the gain are within 45 degrees: sqrt(2 P) <= sin(45) |G|.
-PHASE_KNOWN = 0.5
+# A phase counts as known where 1.7 standard deviations of the gain are within 45 degrees:
+# 1.7 sqrt(P / 2) <= sin(45) |G|.
+PHASE_KNOWN = 0.6
 # Largest response to a test step of a harmonic whose phase is not known, as a share of its error, and the number of
 # standard deviations that its error must have. With a phase of its own each, they add 2 % to the rms error.
 TEST_SHARE, TEST_ABOVE = 0.2, 3.0
 # Least gain by which an error is divided: a mode that the inverse takes out may leave next to nothing.
-LEAST_GAIN = 0.2
+LEAST_GAIN = 0.1
 # Standard deviation of what is left of the hysteresis, as a share of the path's harmonics nearby.
 REST_SHARE, TURN_SHARE = 0.1, 0.02
-# Least variance of a gain; random walk of a gain from pass to pass (variance), and of the repeating error (share of its
-# noise).
-LEAST_VARIANCE, GAIN_WALK, ERROR_WALK = 1e-8, 1e-4, 0.02
+# Random walk of the repeating error from pass to pass, as a share of its noise (variance).
+ERROR_WALK = 0.02
 # Share of an unexpected change, as in the neighbouring harmonics, that is taken for a change of the repeating error.
 CHANGED_SHARE, NEIGHBOURS = 0.2, 3
 # Share of the new estimate of what comes with a change of the path.
 SCATTER_SHARE = 0.3
+# Share that is left after another pass of a gain's variance by what was not foretold, and where nothing has tested it;
+# share of what the changes of one harmonic alone say of its gain.
+FORGOTTEN, KEPT, OWN_KEPT = 0.4, 0.9, 0.9
+# Most of that variance, as a multiple of that of the first guess.
+MOST_MISFIT = 4.0
 # A share of the noise's new estimate in each pass, of one harmonic and (by this number of harmonics) of the floor.
 NOISE_SHARE, FLOOR_COUNT = 0.1, 200.0
+
+
+@dataclass(frozen=True)
+class Answer:
+    """Answer of the displacement to a change of the path, as estimated from passes; arrays of shape (K,).
+
+    Parameters
+    ----------
+    gain : ndarray of complex, metres per metre
+        Of each harmonic when it has settled.
+    variance : ndarray
+        Its variance.
+    transient : ndarray of complex, metres
+        What the last pass still had of the answers to the changes before, and of its beginning from rest.
+    transient_variance : ndarray, metres squared
+    """
+
+    gain: ComplexArray
+    variance: FloatArray
+    transient: ComplexArray
+    transient_variance: FloatArray
 
 
 @dataclass(frozen=True)
 class Harmonics:
     """What is known of the harmonics of a pass of N samples; arrays of shape (K,), K = N // 2 + 1, as `numpy.fft.rfft`.
 
-    The reading of harmonic k for a correction ``C`` of the desired path is ``Y = d + G C + n``. The gain ``G`` is
-    constant but for a small random walk, ``d`` (what is read without a correction) walks by what the passes themselves
-    show, and ``n`` is noise. Both are estimated together from all passes: a scalar reading and a state of two for each
-    harmonic.
+    The reading of harmonic k, without its transient, for a correction ``C`` of the desired path is ``Y = d + G C + n``.
+    The gain ``G`` is that of all passes together (`slpi_ros.learning.dynamics.Dynamics`), ``d`` (what is read without a
+    correction) walks by what the passes themselves show, and ``n`` is noise. What is filtered is the expected reading
+    at the last correction, so that an error of the gain counts for the change of the correction only.
 
     Parameters
     ----------
@@ -53,6 +79,13 @@ class Harmonics:
     scatter : ndarray
         Variance that comes with a change of the path and goes by no gain, as the hysteresis is that of another path: a
         multiple of the mean square of the change's harmonics.
+    misfit : ndarray
+        Variance of the gain by which the last changes were answered otherwise than expected.
+    changed, answers : ndarray, and ndarray of complex
+        What the changes of this harmonic alone say of its gain: information (an inverse variance), and its product with
+        their estimate.
+    guessed : ndarray
+        Variance of the first guess of the gain.
     passes : int
         Number of passes that the estimates come from.
 
@@ -72,13 +105,30 @@ class Harmonics:
     noise: FloatArray
     answered: ComplexArray
     scatter: FloatArray
+    misfit: FloatArray
+    changed: FloatArray
+    answers: ComplexArray
+    guessed: FloatArray
     passes: int = 0
 
     @classmethod
     def first(cls, gain: ComplexArray, variance: FloatArray, noise: FloatArray) -> "Harmonics":
         """Return what is known before the first pass: the first guess of the gains, and the sensor's noise."""
         none = np.zeros_like(gain)
-        return cls(gain, none, variance, np.full(variance.size, np.inf), none, noise, none, np.zeros_like(noise))
+        return cls(
+            gain,
+            none,
+            variance,
+            np.full(variance.size, np.inf),
+            none,
+            noise,
+            none,
+            np.zeros_like(noise),
+            np.zeros_like(noise),
+            np.zeros_like(noise),
+            none,
+            variance,
+        )
 
     def expected(self, correction: ComplexArray) -> ComplexArray:
         """Return the expected reading, (K,), metres, of a pass with a correction (m)."""
@@ -92,26 +142,33 @@ class Harmonics:
 
     @property
     def phase_known(self) -> Mask:
-        """Whether the phase of a gain is known to 45 degrees, with two standard deviations."""
+        """Whether the phase of a gain is known to 45 degrees, with 1.7 standard deviations."""
         return np.asarray(np.sqrt(self.gain_variance) <= PHASE_KNOWN * np.abs(self.gain))
 
-    def begun(self, desired: ComplexArray, reading: ComplexArray, before: ComplexArray) -> "Harmonics":
-        """Return what is known after the first two passes, with no correction: desired, and measured last and before.
-
-        All are of shape (K,), metres. Where the path has more power than what is left of its hysteresis, and than what
-        differs between the passes, the gain is known already.
-        """
-        rest = self._of_hysteresis(desired) + _around(np.abs(reading - before) ** 2)
-        total = self.gain_variance * np.abs(desired) ** 2 + rest + self.noise
-        k_gain = self.gain_variance * desired.conj() / np.maximum(total, 1e-300)
-        gain = self.gain + k_gain * (reading - self.gain * desired)
-        left = self.gain_variance - np.abs(k_gain) ** 2 * total
+    def begun(self, correction: ComplexArray, reading: ComplexArray, answer: Answer) -> "Harmonics":
+        """Return what is known after the first two passes; arguments as of `after`."""
         return replace(
-            self, gain=gain, gain_variance=np.maximum(left, LEAST_VARIANCE), without=reading.copy(),
-            without_variance=self.noise.copy(), passes=1,
+            self._at(correction, reading, self.noise + answer.transient_variance, answer), noise=self.noise, passes=1
+        )
+
+    def at(self, correction: ComplexArray, reading: ComplexArray) -> "Harmonics":
+        """Return the same with what was read, (K,), metres, in an earlier pass with a correction (m)."""
+        steady = Answer(self.gain, self.gain_variance, np.zeros_like(self.gain), np.zeros_like(self.noise))
+        return self._at(correction, reading, self.noise, steady)
+
+    def _at(
+        self, correction: ComplexArray, expected: ComplexArray, variance: FloatArray, answer: Answer
+    ) -> "Harmonics":
+        """Return the same with an expected reading (m) at a correction (m), its variance (m^2), and new gains; (K,)."""
+        return replace(
+            self, gain=answer.gain, gain_variance=answer.variance,
+            without=expected - answer.gain * correction,
+            without_variance=variance + answer.variance * np.abs(correction) ** 2,
+            covariance=-answer.variance * correction.conj(),
+            answered=correction,
         )  # fmt: skip
 
-    def _of_hysteresis(self, path: ComplexArray) -> FloatArray:
+    def of_hysteresis(self, path: ComplexArray) -> FloatArray:
         """Return the variance (m^2, (K,)) of what is left of the hysteresis of a path, (K,), metres, in the reading.
 
         It is a share of the path's own harmonics nearby, and of lower ones where it falls with the square of the
@@ -119,56 +176,65 @@ class Harmonics:
         """
         squared = np.arange(1.0, path.size) ** 2
         turning = np.append(0.0, np.maximum.accumulate(np.abs(path[1:]) * squared) / squared)
-        share = REST_SHARE**2 * _around(np.abs(path) ** 2) + TURN_SHARE**2 * turning**2
-        return np.asarray(share * (np.abs(self.gain) ** 2 + self.gain_variance))
+        share = REST_SHARE**2 * around(np.abs(path) ** 2) + TURN_SHARE**2 * turning**2
+        squares: FloatArray = np.abs(self.gain) ** 2
+        return np.asarray(share * (squares + np.minimum(squares, self.gain_variance)))
 
-    def doubted(self, first: "Harmonics") -> "Harmonics":
-        """Return the same with gains that may be wrong by as much as those of the first guess."""
-        variance = np.maximum(self.gain_variance, first.gain_variance)
-        # The correlation with the repeating error is lost with what it came from.
-        return replace(self, gain_variance=variance, covariance=np.zeros_like(self.covariance))
-
-    def after(self, correction: ComplexArray, reading: ComplexArray, due: Mask) -> "Harmonics":
+    def after(self, correction: ComplexArray, reading: ComplexArray, answer: Answer) -> "Harmonics":
         """Return what is known after another pass.
 
         Parameters
         ----------
         correction, reading : ndarray of complex, (K,), metres
-            Correction of the desired path in this pass, and what was measured.
-        due : ndarray of bool, (K,)
-            Harmonics to learn of; the others stay.
+            Correction of the desired path in this pass, and what was measured, without the transient.
+        answer : Answer
+            What the passes up to this one say of the gains and of the transient.
         """
-        unexpected = reading - self.expected(correction)
+        at_last, change = self.expected(self.answered), correction - self.answered
+        squares: FloatArray = np.abs(change) ** 2
+        gain, gain_variance = self._joint(answer, self.misfit)
+        unexpected = reading - (at_last + gain * change)
         # The hysteresis of the corrected path is another one.
-        moved = self._of_hysteresis(correction - self.answered)
-        before = self.variance(correction) + moved + self.noise
-        beyond = np.maximum(_around(np.abs(unexpected) ** 2) - before, 0.0)
-        scattered, size = self.scatter, float(np.mean(np.abs(correction - self.answered)[1:] ** 2))
+        before, moved = self.variance(self.answered), self.of_hysteresis(change)
+        own = before + gain_variance * squares + moved
+        noise = self.noise + answer.transient_variance
+        beyond = np.maximum(around(np.abs(unexpected) ** 2) - own - noise, 0.0)
+        scattered, size = self.scatter, float(np.mean(squares[1:]))
         scatter = scattered * size
         if size > 0.0:
             new = beyond / (size + float(np.mean(self.noise[1:])))
-            scattered = np.where(due, scattered + SCATTER_SHARE * (new - scattered), scattered)
-        moved, before = moved + scatter, before + scatter
-        changed = CHANGED_SHARE * np.maximum(beyond - scatter, 0.0) + ERROR_WALK * self.noise
-        a, b = self.gain_variance + GAIN_WALK, self.without_variance + changed + moved
-        with_gain = a * correction.conj() + self.covariance
-        with_rest = self.covariance.conj() * correction.conj() + b
-        total = np.maximum((correction * with_gain + with_rest).real, 0.0) + self.noise
-        k_gain, k_rest = with_gain / total, with_rest / total
-        return replace(
+            scattered = scattered + SCATTER_SHARE * (new - scattered)
+        # A gain that has not foretold the answer is not known, whatever is said of it. Small changes tell nothing.
+        answered = around(np.abs(gain) ** 2 * squares)
+        apart = around(np.abs(reading - (at_last + answer.gain * change)) ** 2)
+        apart = np.maximum(apart - before - answer.variance * squares - moved - noise, 0.0)
+        # Where mechanics cannot be, it is the hysteresis that has answered otherwise.
+        most = np.minimum(np.abs(gain) ** 2, MOST_MISFIT * self.guessed)
+        told = np.where(answered > noise, np.minimum(apart / np.maximum(around(squares), 1e-300), most), 0.0)
+        misfit = np.maximum(told, np.where(answered > noise, FORGOTTEN, KEPT) * self.misfit)
+        weight = 1.0 / (noise + before + moved + scattered * size)
+        found = replace(
             self,
-            gain=np.where(due, self.gain + k_gain * unexpected, self.gain),
-            without=np.where(due, self.without + k_rest * unexpected, self.without),
-            gain_variance=np.where(
-                due, np.maximum(a - np.abs(k_gain) ** 2 * total, LEAST_VARIANCE), self.gain_variance
-            ),
-            without_variance=np.where(due, np.maximum(b - np.abs(k_rest) ** 2 * total, 0.0), self.without_variance),
-            covariance=np.where(due, self.covariance - k_gain * k_rest.conj() * total, self.covariance),
-            noise=np.where(due, self._noise_after(np.abs(unexpected) ** 2, before), self.noise),
-            answered=np.where(due, correction, self.answered),
-            scatter=scattered,
-            passes=self.passes + 1,
+            changed=OWN_KEPT * self.changed + weight * squares,
+            answers=OWN_KEPT * self.answers + weight * change.conj() * (reading - at_last),
         )
+        joint, joint_variance = found._joint(answer, misfit)
+        answer = replace(answer, gain=joint, variance=joint_variance)
+        own = own + scatter
+        variance = own + CHANGED_SHARE * np.maximum(beyond - scatter, 0.0) + ERROR_WALK * self.noise
+        share = variance / (variance + noise)
+        now = at_last + gain * change + share * unexpected
+        return replace(
+            found._at(correction, now, (1.0 - share) * variance, answer),
+            noise=self._noise_after(np.abs(unexpected) ** 2, own + noise), scatter=scattered, misfit=misfit,
+            passes=self.passes + 1,
+        )  # fmt: skip
+
+    def _joint(self, answer: Answer, misfit: FloatArray) -> tuple[ComplexArray, FloatArray]:
+        """Return the gain and its variance, (K,), from all harmonics together and from the changes of each alone."""
+        weight = 1.0 / np.maximum(answer.variance + misfit, 1e-300)
+        total = weight + self.changed
+        return (answer.gain * weight + self.answers) / total, 1.0 / total
 
     def _noise_after(self, unexpected: FloatArray, before: FloatArray) -> FloatArray:
         """Return the noise after a pass: a floor that all harmonics share, and more where one scatters more."""
@@ -203,7 +269,7 @@ class Harmonics:
         return step
 
 
-def _around(power: FloatArray) -> FloatArray:
+def around(power: FloatArray) -> FloatArray:
     """Return the mean over neighbouring harmonics, the mean value of the path (harmonic 0) left out."""
     inner = power[1:]
     if inner.size < NEIGHBOURS:

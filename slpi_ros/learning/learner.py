@@ -165,13 +165,15 @@ class Learner:
         remarks = []
         for name, axis in self.axes.items():
             learned = document["axes"][name]
-            same = learned["model"] == self._identity(name)
+            # A file of an earlier version tells nothing of the dynamics.
+            same = learned["model"] == self._identity(name) and "dynamics" in learned
             try:
                 axis.resume(learned, same_model=same)
             except (ModelError, IndexError, KeyError, TypeError, ValueError) as error:
                 raise ModelError(f"{source}: axis '{name}': {error}") from None
             if not same:
-                remarks.append(f"axis '{name}': another model; learned anew, from the correction of the path so far")
+                why = "a file of an earlier version" if learned["model"] == self._identity(name) else "another model"
+                remarks.append(f"axis '{name}': {why}; learned anew, from the correction of the path so far")
         return remarks
 
     def save(self, path: str | os.PathLike[str]) -> None:

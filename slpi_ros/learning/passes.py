@@ -28,6 +28,8 @@ MOST_SUDDEN = 0.1
 MOST_MISSING = 0.1
 # Samples of the running median that finds a glitch in the first pass.
 MEDIAN = 5
+# Samples in a row at a voltage limit that count as held there, and share of the range by which it is reached.
+HELD_SAMPLES, AT_LIMIT = 3, 1e-6
 
 
 @dataclass(frozen=True)
@@ -106,6 +108,14 @@ def agreed(first: FloatArray, second: Judged, desired: FloatArray, noise: float)
         return Judged(second.measured, second.bumps, apart)
     instead = first + np.median(second.measured - first)
     return Judged(np.where(better, instead, second.measured), second.bumps | better, apart)
+
+
+def held_back(voltage: FloatArray, limits: tuple[float, float]) -> str:
+    """Return that a limit held the voltage (V, (N,)) back; "" if none did."""
+    (low, high), margin = limits, AT_LIMIT * (limits[1] - limits[0])
+    at = (voltage <= low + margin) | (voltage >= high - margin)
+    runs = np.convolve(at, np.ones(HELD_SAMPLES), "valid") >= HELD_SAMPLES - 0.5
+    return f"the voltage is held at a limit at {int(np.count_nonzero(at))} of its samples" if runs.any() else ""
 
 
 def _lies(measured: FloatArray, known: Mask, expected: FloatArray, noise: float) -> str:

@@ -81,9 +81,10 @@ class Compensator(LifecycleNode):
     """Lifecycle node that publishes the voltages of all axes for every message with desired displacements.
 
     Subscribes to ``desired_displacement``, ``desired_trajectory``, ``measured_displacement``, ``stage_state``,
-    ``stage_model``, ``voltage_trajectory_state`` and the topics of the quantities that the stage follows, publishes
-    ``voltage_command``, ``voltage_trajectory``, ``tracking_error``, ``displacement_uncertainty`` and
-    ``/diagnostics``, provides the services ``~/reset_memory``, ``~/set_zero``, ``~/forget`` and ``~/arm``.
+    ``stage_model``, ``voltage_trajectory_state``, ``recorded_trajectory`` and the topics of the quantities that the
+    stage follows, publishes ``voltage_command``, ``voltage_trajectory``, ``tracking_error``,
+    ``displacement_uncertainty`` and ``/diagnostics``, provides the services ``~/reset_memory``, ``~/set_zero``,
+    ``~/forget`` and ``~/arm``.
     Message types, units and QoS are documented in ``msg_schemas/README.md``, parameters in `compensator_parameters`.
     """
 
@@ -203,6 +204,7 @@ class Compensator(LifecycleNode):
             self._subscribe(JointState, "measured_displacement", self._on_measured, MEASUREMENTS, raw=True),
             self._subscribe(String, "stage_model", self._on_model, LATCHED),
             self._subscribe(DiagnosticStatus, "voltage_trajectory_state", self._on_block_state, LATCHED),
+            self._subscribe(JointTrajectory, "recorded_trajectory", self._on_recorded, COMMANDS, raw=True),
         ]
         self._controller.configure()
         self._report()
@@ -467,6 +469,7 @@ class Compensator(LifecycleNode):
 
     def _send_block(self, names: Sequence[str], times: ArrayLike, positions: ArrayLike, later: bool) -> None:
         """Publish a trajectory as one block of voltages."""
+        path, (names, times, positions) = self._learning.corrected(names, times, positions, as_block=True)
         try:
             if later:
                 raise RejectedError(STALE, "a block begins as soon as the device has it; stamp the trajectory 0")
@@ -475,6 +478,7 @@ class Compensator(LifecycleNode):
         except RejectedError as error:
             self._reject("trajectory ", error)
             return
+        self._learning.begin_block(path, block)
         none = np.zeros((len(block.voltages), 0))
         self._block_publisher.publish(encode_trajectory(stamp_ns, block.names, block.times_ns, none, block.voltages))
         self.get_logger().info(
@@ -503,6 +507,16 @@ class Compensator(LifecycleNode):
                 self.get_logger().warning(said)
             self._save_memory(complete=False)
             self._report()
+
+    def _on_recorded(self, data: bytes) -> None:
+        """Take what a device has recorded of a block."""
+        if self._learning.mode == OFF:
+            return
+        read, applied = decode_trajectory(data), decode_trajectory(data, "effort")
+        if read and applied:
+            self._learning.passes.recorded(
+                read.start_ns, read.names, read.time_from_start_ns, read.values, applied.values
+            )
 
     def _tell_late(self) -> None:
         """Log that points of a trajectory were skipped, or late."""

@@ -240,11 +240,6 @@ class CompensatorSettings:
                 f"model_sha256 {values['model_sha256']!r} is not 64 hexadecimal digits in lower case; give the output "
                 "of sha256sum, or nothing"
             )
-        if values["learn"] != "off" and values["trajectory_output"] == "block":
-            raise UsageError(
-                f"learn is {values['learn']!r}, and trajectory_output is 'block': passes that a device plays by itself "
-                "are learned by slpi learn, from the bags; set learn to off, or trajectory_output to stream"
-            )
         gains = zip(values["kp"], values["ki"], values["kd"], values["derivative_filter"], strict=True)
         timeout = values["measurement_timeout"]
         limits = _limits(values)

@@ -12,6 +12,7 @@ from typing import Any
 
 from numpy.typing import ArrayLike
 
+from slpi_ros.compensator.block import Block, sampling_period
 from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.path_passes import ComingAgain, PassRecorder, PathPasses
 from slpi_ros.compensator.trajectory import Trajectory
@@ -137,9 +138,12 @@ class PathLearning:
         self._ask(lambda: Opening(format_model(model), prefix, limit))
 
     def corrected(
-        self, names: Sequence[str], times: ArrayLike, positions: ArrayLike
+        self, names: Sequence[str], times: ArrayLike, positions: ArrayLike, *, as_block: bool = False
     ) -> tuple[SampledPath | None, tuple[Sequence[str], ArrayLike, ArrayLike]]:
-        """Return the path of a trajectory, None if none is learned, and the trajectory with what was learned of it."""
+        """Return the path of a trajectory, None if none is learned, and the trajectory with what was learned of it.
+
+        `as_block`: its samples are as far apart as those of a block.
+        """
         plain = names, times, positions
         if self.mode == OFF or not len(times):  # type: ignore[arg-type]
             return None, plain
@@ -149,6 +153,8 @@ class PathLearning:
             valid = Trajectory.of(names, times, positions, axes=self._controller.names)
         except RejectedError:
             return None, plain
+        if as_block:
+            period = sampling_period(valid.time_from_start_ns, period)
         path = SampledPath.of(valid.names, valid.time_from_start_ns, valid.positions, period, self.period)
         correction = self.passes.corrections.get(path.identity) if path else None
         return path, (path.corrected(correction, period) if path and correction else plain)
@@ -159,6 +165,11 @@ class PathLearning:
             self.passes.end(start_ns or clock_ns)
             return
         self.passes.begin(path, start_ns, clock_ns, self._controller.trajectory.period, self.mode == ON)
+
+    def begin_block(self, path: SampledPath | None, block: Block) -> None:
+        """Take notice of a block that a device will play and record; no path: it is not learned."""
+        if path is not None:
+            self.passes.begin_block(path, block, self.mode == ON)
 
     def poll(self, clock_ns: int) -> None:
         """Take what has been learned, and have passes learned that have ended."""
@@ -179,8 +190,8 @@ class PathLearning:
                     self.progress = dict(one.axes)
         if self.mode != OFF and not self._opened:
             self._open()
-        if clock_ns and self.passes.on:
-            if self._controller.mode is not OperatingMode.TRAJECTORY:
+        if clock_ns:
+            if self.passes.on and self._controller.mode is not OperatingMode.TRAJECTORY:
                 self.passes.end(clock_ns)
             done = tuple(self.passes.take(clock_ns))
             if done and self.waiting < MOST_WAITING:

@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from slpi_ros.compensator.block import Block
 from slpi_ros.compensator.path_passes import LATE, ComingAgain, PathPasses
 from slpi_ros.compensator.statistics import TrackingStatistics
 from slpi_ros.learning.repeated_paths import MOST_SAMPLES, SampledPath
@@ -221,3 +222,58 @@ def test_forgetting_begins_anew():
     passes.forget()
     assert not passes.on and not passes.corrections
     assert follow(passes, path, START + 1_000 * MS) == []
+
+
+LEAD_IN = 7
+
+
+def block(stamp_ns=START, missed=""):
+    """Return the block of the path, after a way to its beginning."""
+    v = np.concatenate([np.linspace(10.0, 20.0, LEAD_IN), 20.0 + 1e6 * Y])
+    return Block(stamp_ns, ("x",), PERIOD, v[:, None], LEAD_IN, missed)
+
+
+def recorded(passes, one, late_ns=2 * MS, part=slice(None), volts=0.0):
+    """Tell what a device has recorded of a block: readings and voltages."""
+    read = np.concatenate([np.zeros(LEAD_IN), Y + 3e-9])[part, None]
+    passes.recorded(one.stamp_ns + late_ns, ["x"], one.times_ns[part], read, one.voltages[part] + volts)
+    return passes.ready(START + 10_000 * MS)
+
+
+def test_a_pass_that_a_device_has_played_is_what_it_has_recorded():
+    passes, path = Passes(), sampled()
+    passes.corrections[path.identity] = {"x": np.full(N, 8e-9)}
+    passes.begin_block(path, block(), True)
+    assert not passes.on
+    (done,) = recorded(passes, block())
+    assert not done.dropped and not done.unusable
+    assert done.measured["x"] == pytest.approx(Y + 3e-9, abs=1e-15)
+    assert done.followed["x"] == pytest.approx(Y + 8e-9, abs=1e-15)
+    assert done.voltage["x"] == pytest.approx(20.0 + 1e6 * Y)
+    # It is told once.
+    assert recorded(passes, block()) == []
+
+
+def test_a_recording_of_something_else_tells_nothing():
+    passes, path = Passes(), sampled()
+    passes.corrections[path.identity] = {}
+    for given in ({"late_ns": -1_000 * MS}, {"part": slice(0, N // 2)}, {"volts": 5.0}):
+        passes.begin_block(path, block(), True)
+        assert recorded(passes, block(), **given) == []
+        passes.forget()
+        passes.corrections[path.identity] = {}
+    passes.begin_block(path, block(), False)
+    assert recorded(passes, block()) == []
+    # Of two blocks, the recording is that of the last one before it.
+    for stamp in (START, START + 500 * MS):
+        passes.begin_block(path, block(stamp), True)
+    assert len(recorded(passes, block(START + 500 * MS))) == 1
+    assert recorded(passes, block()) == []
+
+
+def test_a_block_that_a_limit_holds_back_is_not_learned_from():
+    passes, path = Passes(), sampled()
+    passes.corrections[path.identity] = {}
+    passes.begin_block(path, block(missed="axis 'x', 0.02 s after the beginning of the path: too fast"), True)
+    (done,) = recorded(passes, block())
+    assert "too fast" in done.unusable["x"]

@@ -2,6 +2,7 @@
 
 import socket
 import time
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -47,15 +48,16 @@ class Bench:
             self.graph.spin_for(0.5)
             if self.blocks:
                 return
-        raise AssertionError("no block came")
+        raise AssertionError(f"no block came: {self.compensator.stderr}")
 
     def until(self, message):
         self.graph.spin_until(lambda: message in [each.message for each in self.told], message)
         return next(values_of(each) for each in reversed(self.told) if each.message == message)
 
 
-@pytest.fixture
-def bench(tmp_path):
+@contextmanager
+def benched(tmp_path, **options):
+    """Start compensator, driver and simulated controller, with options of the compensator."""
     model = stage_model(("x",))
     save_model(model, tmp_path / "model.json")
     limits = {"voltage_min": 0.0, "voltage_max": 100.0}
@@ -69,6 +71,7 @@ def bench(tmp_path):
         "slew_limit": SLEW,
         "trajectory_output": "block",
         **limits,
+        **options,
     }
     with (
         started("device_simulator", device) as simulator,
@@ -76,11 +79,18 @@ def bench(tmp_path):
     ):
         while "own range" not in simulator.stderr:
             assert simulator.process.poll() is None
-        with started("driver", driver) as node, started("compensator", compensator):
+        with started("driver", driver) as node, started("compensator", compensator) as other:
             graph.tested = node
             made = Bench(graph)
+            made.compensator = other
             made.model = model
             yield made.connect()
+
+
+@pytest.fixture
+def bench(tmp_path):
+    with benched(tmp_path) as made:
+        yield made
 
 
 def path(model, seconds, period=PERIOD):
@@ -129,3 +139,33 @@ def test_it_is_stopped_where_it_is(bench, how):
     there = bench.blocks[0].points[sample - 1].effort[0]
     bench.graph.spin_for(0.3)
     assert bench.states[-1].effort[0] == pytest.approx(there, abs=1e-5)
+
+
+@pytest.mark.long
+def test_what_the_device_has_recorded_of_a_path_that_comes_again_is_learned(tmp_path):
+    # Slowly, and armed again: a busy machine hears late of where the block is.
+    with benched(tmp_path, learn="on", rearm=True) as bench:
+        low, high = bench.model.axis("x").displacement_range
+        y = 0.5 * (low + high) + 0.06 * (high - low) * np.sin(np.linspace(0.0, 2 * np.pi, 201))
+        errors, told = [], {}
+        for number in range(12):
+            bench.blocks.clear()
+            bench.told.clear()
+            bench.send(y, 5e-3)
+            bench.until("ended")
+            bench.graph.spin_until(lambda number=number: len(bench.recordings) > number, "what was recorded")
+            points = bench.recordings[-1].points
+            at = np.array([each.time_from_start.sec + 1e-9 * each.time_from_start.nanosec for each in points])
+            read = np.interp(at[-1] - 1.0 + np.arange(y.size) * 5e-3, at, [each.positions[0] for each in points])
+            errors.append(float(np.std(read - y)))
+            wanted = {"x.learn_pass": str(number + 1)} if number else {}
+            status = bench.graph.wait_for_status(
+                "/compensator: compensator",
+                lambda status, wanted=wanted: wanted.items() <= values_of(status).items(),
+                f"pass {number + 1}",
+            )
+            told = values_of(status)
+        assert told["x.learn_reason"] == "" and told["learn_dropped"] == ""
+        # The model is not that of the simulated stage.
+        assert errors[1] > 50e-9
+        assert errors[-1] < 0.2 * errors[1]

@@ -70,8 +70,7 @@ def test_learning_is_off_and_takes_what_yaml_makes_of_on_and_off():
     assert (told["learn"], told["learn_period"], told["learn_limit"]) == ("off", 0.0, None)
     assert [settings(learn=given).values["learn"] for given in (True, False, "hold")] == ["on", "off", "hold"]
     assert settings(axes=["x", "y"], learn_limit=[1e-7, 2e-7]).values["learn_limit"] == (1e-7, 2e-7)
-    with pytest.raises(UsageError, match="learn is 'on', and trajectory_output is 'block'"):
-        settings(learn="on", trajectory_output="block")
+    assert settings(learn="on", trajectory_output="block").values["learn"] == "on"
 
 
 @pytest.mark.parametrize("use", [{"on_timeout": "safe"}, {"on_deactivate": "safe"}, {"reset_to": "safe"}])

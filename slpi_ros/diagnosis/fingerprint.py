@@ -32,8 +32,9 @@ ROUGHNESS = 1e-5
 LEAST_SHARE = 0.05
 # Largest number of spectral lines and of jumps; power of a line relative to the median of its surroundings.
 MOST_LINES, MOST_JUMPS, LINE = 6, 8, 30.0
-# Lines of this share of the largest amplitude are told; fewest periods of one in its record.
-TALL, PERIODS = 0.1, 10.0
+# Lines of this share of the largest amplitude are told; fewest periods of one in its record; frequency (Hz) below which
+# lines are slow.
+TALL, PERIODS, SLOW = 0.1, 10.0, 1.0
 # Largest number of samples of a record, evenly thinned, for functions of a variable.
 ENOUGH = 40_000
 
@@ -265,9 +266,12 @@ def _of_lines(records: Sequence[Signals]) -> Iterator[Left]:
         tall = [each for each in zip(lines, heights, strict=True) if each[1] >= TALL * max(heights)]
         told += [f"{frequency:.4g} Hz ({length(height)})" for frequency, height in tall]
     name = "lines of the spectrum"
-    yield Left(
-        name, share, f"{share:.0%} of the mean square is in lines at {', '.join(told[:MOST_LINES])}; {HINTS[name]}"
+    # No mains and no pump is so slow.
+    slow = max(frequency for lines in found for frequency in lines) < SLOW
+    advice = (
+        "look for what comes and goes so slowly, such as an air conditioning, and record it" if slow else HINTS[name]
     )
+    yield Left(name, share, f"{share:.0%} of the mean square is in lines at {', '.join(told[:MOST_LINES])}; {advice}")
 
 
 def _lines(record: Signals) -> list[float]:

@@ -1,8 +1,9 @@
 """Diagnosis of a model on records: its errors, their causes, and the model extended by them."""
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -33,6 +34,8 @@ from slpi_ros.model.axis_model import ABOVE_NOISE, AxisModel, Start
 from slpi_ros.model.sensor import IDEAL, corrected
 from slpi_ros.model.stage_model import StageModel
 
+# `select`, with where it begins.
+_Select = Callable[[Explanation, Explanation | None], Selection]
 # Kinds that are refitted together with the effects. Any other kind is reported as unsuitable if its error exceeds that
 # of the loop family by this factor.
 REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
@@ -182,7 +185,8 @@ def _diagnose_axis(
     other_kind = not fitted and before > WRONG_KIND * base.held_out.rms
 
     def attempt(not_first: Collection[str], *, unsure: bool = False) -> _Attempt:
-        found = _selected(base, family if fitted else None, not_first, unsure=unsure)
+        chosen = partial(select, not_first=not_first, unsure=unsure)
+        found = _selected(base, family if fitted else None, chosen)
         if other_kind:
             found = replace(found, structures=(BIAS, *found.structures))
         return _attempt(model, found, runs)
@@ -339,14 +343,12 @@ def _not_as_judged(after: Sequence[FreeRun], runs: Sequence[FreeRun], selection:
     return _leaves_more(selection, ABOVE_NOISE)
 
 
-def _selected(
-    base: Explanation, of_family: Evidence | None, not_first: Collection[str], *, unsure: bool = False
-) -> Selection:
+def _selected(base: Explanation, of_family: Evidence | None, chosen: _Select) -> Selection:
     """Return the selection of effects, made with a coarser hysteresis if that is as good, and the joint fit without."""
     evidence, coarse = base.evidence, base.evidence.coarse
     if coarse is not evidence:
         quick = Explanation(coarse, base.effects)
-        selection = _of_kind(quick, of_family.coarse if of_family else None, not_first, unsure=unsure)
+        selection = _of_kind(quick, of_family.coarse if of_family else None, chosen)
         finest = of_family if of_family and BIAS in selection.structures else evidence
         # A smoothness that suits few vertices may leave many without any hold.
         finer = replace(selection.now.evidence, basis=finest.basis, smoothness=evidence.smoothness)
@@ -360,25 +362,19 @@ def _selected(
             selection = settled(replace(selection, base=base), start, now)
             if _explains_all(selection):
                 return selection
-    return _of_kind(base, of_family, not_first, unsure=unsure)
+    return _of_kind(base, of_family, chosen)
 
 
-def _of_kind(
-    base: Explanation, of_family: Evidence | None, not_first: Collection[str], *, unsure: bool = False
-) -> Selection:
+def _of_kind(base: Explanation, of_family: Evidence | None, chosen: _Select) -> Selection:
     """Return the selection, with the loop family as hysteresis if clearly better than the kind of `base`."""
     if of_family is None:
-        return select(base, None, not_first, unsure=unsure)
+        return chosen(base, None)
     family = Explanation(of_family, base.effects)
     if counts(base.held_out, family.held_out):
-        return select(base, family, not_first, unsure=unsure)
-    selection = select(base, None, not_first, unsure=unsure)
+        return chosen(base, family)
+    selection = chosen(base, None)
     with_effects = Explanation(of_family, selection.now.effects).refined(2)
-    return (
-        select(base, family, not_first, unsure=unsure)
-        if counts(selection.now.held_out, with_effects.held_out)
-        else selection
-    )
+    return chosen(base, family) if counts(selection.now.held_out, with_effects.held_out) else selection
 
 
 def _repeatability(now: Explanation) -> Repeatability:

@@ -324,7 +324,7 @@ def _at_stamps(record: Record, t: FloatArray) -> dict[str, FloatArray]:
         if reason := of_stage(record, (at, value)):
             warnings.warn(f"{record.source}: {key} is not used: {reason}", stacklevel=2)
             continue
-        found[key] = np.interp(t, *smoothed(course))
+        found[key] = np.interp(t, *smoothed((at, value)))
     return found
 
 

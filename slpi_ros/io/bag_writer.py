@@ -160,9 +160,8 @@ def write_bag(
         stamps = (int(record.time_ns[0]) + np.rint(t * 1e9).astype(np.int64)).tolist()
         written += [(at, key, float64(each)) for at, each in zip(stamps, value.tolist(), strict=True)]
     with BagWriter(path, storage=storage, topic=topic, replace=replace) as bag:
-        for name, kind in ((DESIRED, JOINT_STATE), *((key, FLOAT64) for key in beside)):
-            if name != DESIRED or desired:
-                bag.add_topic(name, kind)
+        for name, kind in {**({DESIRED: JOINT_STATE} if desired else {}), **dict.fromkeys(beside, FLOAT64)}.items():
+            bag.add_topic(name, kind)
         for stamp, name, message in sorted(written, key=lambda one: one[0]):
             bag.write(stamp, message, name)
 

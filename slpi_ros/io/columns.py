@@ -257,27 +257,29 @@ def choose_columns(names: Sequence[str], options: ColumnOptions, source: str) ->
     driven = _one_for_each(moved, [parse_column(name, VOLTAGE, source=source) for name in driven_names], source)
     axes = _axis_names(moved, options.axes, source)
     taken = {time.name, *(column.name for column in (*moved, *driven))}
-    wanted_names, left_out = [match_column(name, names) for name in options.desired], []
+    wanted_names, left_out = [match_column(name, names) for name in options.desired], dict[str, str]()
     for name in () if wanted_names else names:
         if name not in taken and is_desired(name):
             unit = _split(name, DISPLACEMENT)[1]
             if unit and not DISPLACEMENT.unit(unit):
-                left_out.append(f"'{name}': {unit} is no unit of displacement")
+                left_out[name] = f"{unit} is no unit of displacement"
             else:
                 wanted_names.append(name)
     wanted = [_parse_desired(name, given_unit, source) for name in wanted_names]
     desired, of_none = _of_axes(wanted, moved, axes, source, named=bool(options.desired))
-    left_out += [f"'{column.name}': no axis '{column.axis}'" for column in of_none]
+    left_out |= {column.name: f"no axis '{column.axis}'" for column in of_none}
     _require_one_role(time, (*moved, *desired.values()), driven, source)
     used = {*taken, *(column.name for column in wanted)}
-    rest = [name for name in names if name not in used]
-    quantities = [name for name in rest if name.startswith("/")]
-    told = {text.partition("'")[2].partition("'")[0] for text in left_out}
-    others = [name for name in rest if name not in quantities and name not in told and name]
+    rest = [name for name in names if name and name not in used]
     return ColumnChoice(
-        time, dict(zip(axes, driven, strict=True)), dict(zip(axes, moved, strict=True)), desired, tuple(left_out),
-        tuple(quantities), tuple(others),
-    )  # fmt: skip
+        time=time,
+        voltage=dict(zip(axes, driven, strict=True)),
+        displacement=dict(zip(axes, moved, strict=True)),
+        desired=desired,
+        left_out=tuple(f"'{name}': {reason}" for name, reason in left_out.items()),
+        quantities=tuple(name for name in rest if name.startswith("/")),
+        others=tuple(name for name in rest if not name.startswith("/") and name not in left_out),
+    )
 
 
 def _time_column(names: Sequence[str], source: str) -> str:

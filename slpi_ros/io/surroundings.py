@@ -154,15 +154,8 @@ def wild(value: FloatArray) -> Mask:
 
 
 def smoothed(course: Course) -> Course:
-    """Return a recorded quantity, noisy and with missing readings (NaN), without these and without most of the noise.
-
-    Between its readings it is linear, and beyond them as it is there.
-    """
-    return _smoothed(*clean(course))
-
-
-def _smoothed(t: FloatArray, value: FloatArray) -> Course:
-    """Return the readings without most of their noise."""
+    """Return the readings of a `clean` course without most of their noise: between them the quantity is linear."""
+    t, value = course
     # An error of the quantity itself makes its gain look smaller: by the share of the noise in its variance.
     if t.size < FEWEST_READINGS:
         return t, value

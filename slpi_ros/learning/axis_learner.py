@@ -10,7 +10,7 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import ModelError, length
-from slpi_ros.learning.dynamics import Dynamics, Pass
+from slpi_ros.learning.dynamics import Dynamics, Measured, Pass
 from slpi_ros.learning.first_guess import first_guess, known_modes, ringing
 from slpi_ros.learning.harmonics import ComplexArray, Harmonics
 from slpi_ros.learning.passes import Judged, agreed, held_back, judge
@@ -323,9 +323,8 @@ class AxisLearner:
         begun = self._undisturbed
         path = self.wanted + np.fft.rfft(begun.commanded)
         rest = h.of_hysteresis(path)
-        answer = self.dynamics.answer(
-            self._history, self.spectrum.whole(self.correction), begun, path, rest, h.noise, h.of_hysteresis
-        )
+        aim = self.spectrum.whole(self.correction)
+        answer = self.dynamics.answer(Measured(self._history, aim, begun, path, rest, h.noise, h.of_hysteresis))
         settled = seen - answer.transient
         self.harmonics = h.after(correction, settled, answer) if h.passes else h.begun(correction, settled, answer)
         power = self.spectrum.power

@@ -71,6 +71,22 @@ class Tone:
     size: float  # m, standard deviation of the sum over the samples of what excites
 
 
+@dataclass(frozen=True)
+class Measured:
+    """Passes, and how well each of their harmonics is known."""
+
+    # In a row up to the one that was just measured; of the first, the answers to what was before it are not known.
+    passes: Sequence[Pass]
+    # What the last pass has made of the correction, without what was for this pass only, (N,), metres.
+    aim: FloatArray
+    undisturbed: Pass  # the one before the first change
+    desired: ComplexArray  # the path of that pass, (K,), metres
+    rest: FloatArray  # variance of what is not linear in `desired`, (K,), metres squared
+    noise: FloatArray  # (K,), metres squared
+    # Returns the variance (m^2, (K,)) of what is not linear in a change of the path (m, (K,)).
+    of_change: Callable[[ComplexArray], FloatArray]
+
+
 class Dynamics:
     """Estimates the answer to a change of the path.
 
@@ -139,41 +155,15 @@ class Dynamics:
         linear = answers[:, : self._parameters.size]
         return np.asarray(linear @ self._parameters + self._rung_on(poles, len(passes) - 1))
 
-    def answer(
-        self,
-        passes: Sequence[Pass],
-        aim: FloatArray,
-        undisturbed: Pass,
-        desired: ComplexArray,
-        rest: FloatArray,
-        noise: FloatArray,
-        of_change: Callable[[ComplexArray], FloatArray],
-    ) -> Answer:
-        """Return the estimate after some passes, the last of which was just measured.
-
-        Parameters
-        ----------
-        passes : sequence of Pass
-            Those in a row up to the last; of the first of them, the answers to what was before it are not known.
-        aim : ndarray, shape (N,), metres
-            What the last pass has made of the correction, without what was for this pass only.
-        undisturbed : Pass
-            The one before the first change.
-        desired : ndarray of complex, shape (K,), metres
-            The path of that pass.
-        rest : ndarray, shape (K,), metres squared
-            Variance of what is not linear in `desired`.
-        noise : ndarray, shape (K,), metres squared
-        of_change : callable
-            Returns the variance (m^2, (K,)) of what is not linear in a change of the path (m, (K,)).
-        """
-        search = len(passes) <= SEARCH_PASSES and sum(not mode.exact for mode in self._begun) < MOST_MODES
+    def answer(self, given: Measured) -> Answer:
+        """Return the estimate after some passes, the last of which was just measured."""
+        search = len(given.passes) <= SEARCH_PASSES and sum(not mode.exact for mode in self._begun) < MOST_MODES
         for _ in range(ITERATIONS if self.modes else 1):
-            found = self._estimate(passes, aim, undisturbed, desired, rest, noise, of_change, search=search)
+            found = self._estimate(given, search=search)
             search = False
             if self._missing is not None:
                 self._add(self._missing)
-                return self.answer(passes, aim, undisturbed, desired, rest, noise, of_change)
+                return self.answer(given)
         return found
 
     def _add(self, mode: Mode) -> None:
@@ -210,18 +200,8 @@ class Dynamics:
         if document["parameters"] is not None:
             self._parameters = np.array(document["parameters"])
 
-    def _estimate(
-        self,
-        passes: Sequence[Pass],
-        aim: FloatArray,
-        undisturbed: Pass,
-        desired: ComplexArray,
-        rest: FloatArray,
-        noise: FloatArray,
-        of_change: Callable[[ComplexArray], FloatArray],
-        *,
-        search: bool,
-    ) -> Answer:
+    def _estimate(self, given: Measured, *, search: bool) -> Answer:
+        passes, undisturbed, of_change = given.passes, given.undisturbed, given.of_change
         assert undisturbed.reading is not None
         poles = ModeAnswers(self.modes, self._residues, self._rings)
         answers, fixed = self._answers(passes, poles), self._response(self._w, poles)
@@ -244,22 +224,22 @@ class Dynamics:
                 # What settles slowly ends elsewhere than it begins: its harmonics fall with their number.
                 settling = float(np.abs(differ[1:4]).max()) ** 2 / np.maximum(np.arange(differ.size), 1) ** 2
                 answered = self._joined(answers[j] - answers[last], rung[j] - rung[last], toned[j] - toned[last])
-                variance = 2.0 * noise + (of_change(moved) if moved.any() else settling)
+                variance = 2.0 * given.noise + (of_change(moved) if moved.any() else settling)
                 rows.append(Row(answered, differ, variance, j, last))
             last, reading = j, one.reading
         # The path itself: what it excites, but for what is left of its hysteresis.
-        whole = self._joined(fixed * desired[:, None], no_ringing if free is None else rung[free], no_tones)
-        rows.append(Row(whole, np.fft.rfft(undisturbed.reading), rest + noise, free, None))
+        whole = self._joined(fixed * given.desired[:, None], no_ringing if free is None else rung[free], no_tones)
+        rows.append(Row(whole, np.fft.rfft(undisturbed.reading), given.rest + given.noise, free, None))
         prior = self._prior(poles, float(np.std(undisturbed.reading)), tones)
         rows, parameters, covariance = solved(rows, prior)
         self._oldest = self._own_part(rows[0], parameters) if rows[0].before == 0 else None
-        self._missing = self._missing_mode(passes, desired, rows, parameters, covariance) if search else None
+        self._missing = self._missing_mode(passes, given.desired, rows, parameters, covariance) if search else None
 
         response = self._joined(fixed, no_ringing, no_tones)
         gain, now = response @ parameters, np.zeros_like(response)
         if self._follow:
             still = self._tone_columns(tones, poles, len(passes) - 1, settled=False)
-            now = self._joined(answers[-1] - self._settled(aim, poles), rung[-1], still)
+            now = self._joined(answers[-1] - self._settled(given.aim, poles), rung[-1], still)
         found = Answer(
             gain, variance_of(response, covariance) + (UNLIKE * np.abs(gain)) ** 2, now @ parameters,
             variance_of(now, covariance),

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.io.record import Record
-from slpi_ros.io.surroundings import smoothed
+from slpi_ros.io.surroundings import clean, smoothed
 from slpi_ros.model.axis_model import AxisModel, StartMemory
 from slpi_ros.model.coupling import Coupling
 from slpi_ros.model.limits import Limits
@@ -187,7 +187,9 @@ class StageModel:
 
     def surrounded(self, record: Record) -> "StageModel":
         """Return the model in the surroundings of a record, on its clock; reference values where it has none."""
-        courses = {key: smoothed(record.surroundings[key]) for key in self.quantities if key in record.surroundings}
+        courses = {
+            key: smoothed(clean(record.surroundings[key])) for key in self.quantities if key in record.surroundings
+        }
         return replace(self, axes={name: axis.surrounded(courses) for name, axis in self.axes.items()})
 
     def within(self, t: FloatArray, surroundings: Mapping[str, ArrayLike]) -> "StageModel":

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from slpi_ros.learning.dynamics import Dynamics, Pass
+from slpi_ros.learning.dynamics import Dynamics, Measured, Pass
 from slpi_ros.learning.modes import Mode, ModeAnswers, candidates
 
 SIZE, DT, HERTZ, DAMPING = 100, 1.0 / 4000.0, 335.0, 0.01
@@ -48,8 +48,10 @@ def test_a_mode_is_found_or_refined_and_its_transient_is_told(told):
     for count in range(2, 7):
         so_far = history[:count]
         found = dynamics.answer(
-            so_far, so_far[-1].commanded, history[1], desired, 1e-4 * np.abs(desired) ** 2, power,
-            lambda change: 1e-4 * np.abs(change) ** 2,
+            Measured(
+                so_far, so_far[-1].commanded, history[1], desired, 1e-4 * np.abs(desired) ** 2, power,
+                lambda change: 1e-4 * np.abs(change) ** 2,
+            )
         )  # fmt: skip
     nearest = min(dynamics.modes, key=lambda one: abs(one.angle - mode.angle))
     assert nearest.angle == pytest.approx(mode.angle, rel=2e-3)

@@ -5,7 +5,9 @@ import fcntl
 import os
 import signal
 import tempfile
+import time
 from collections.abc import Callable, Generator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +21,8 @@ STREAM = "nodes"
 TOGETHER = ("fleet", "documentation")
 # Those that compute more than they wait, and need no core at any moment.
 COMPUTES = ("test_identify.py", "test_site.py")
+# Younger shared memory is left alone, s.
+NEW_S = 10.0
 
 
 def _reserve_ros_domain() -> int:
@@ -35,6 +39,19 @@ def _reserve_ros_domain() -> int:
         atexit.register(lock.close)  # keeps the file, and with it the lock, until the end
         return domain
     raise RuntimeError("all ROS domains are taken by other test runs; wait for one to end")
+
+
+def _remove_shared_memory() -> None:
+    """Remove what participants of Fast DDS that were killed left in shared memory, 0.5 MB each.
+
+    The lock beside each segment is held as long as its owner lives; a segment that is new may have no lock yet.
+    """
+    for lock in Path("/dev/shm").glob("fastrtps_" + 16 * "[0-9a-f]" + "_el"):
+        with suppress(OSError), lock.open() as file:
+            if time.time() - lock.stat().st_mtime > NEW_S:
+                fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                lock.with_name(lock.name.removesuffix("_el")).unlink(missing_ok=True)
+                lock.unlink()
 
 
 # The tests run on all cores already: threads of BLAS would only wait for each other. Read when NumPy is imported.
@@ -87,6 +104,9 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
             together = file.parent.name in (STREAM, *TOGETHER) and file.name not in COMPUTES
             return file.parent.name if together else str(file)
 
+        def mark_test_pending(self, item: str) -> None:
+            """Give the test in which a worker died its second try: `remove_node` has queued it again already."""
+
     # As sorted above.
     config.option.loadscopereorder = False
     return ByFile(config, log)
@@ -97,6 +117,12 @@ def pytest_runtest_setup(item: pytest.Item) -> None:
     """Let nodes have the cores when they want them: pure numerics on other workers stand back."""
     if "PYTEST_XDIST_WORKER" in os.environ and not item.get_closest_marker("ros"):
         os.setpriority(os.PRIO_PROCESS, 0, max(os.getpriority(os.PRIO_PROCESS, 0), 10))
+
+
+def pytest_sessionfinish(session: pytest.Session) -> None:
+    """Tidy up once all workers have ended."""
+    if not hasattr(session.config, "workerinput"):
+        _remove_shared_memory()
 
 
 def _refuse_skip(report: pytest.TestReport | pytest.CollectReport) -> None:

@@ -17,8 +17,8 @@ from slpi_ros.learning.passes import Judged, agreed, held_back, judge
 from slpi_ros.learning.spectrum import PathSpectrum
 from slpi_ros.model.axis_model import AxisModel
 
-# Gain of a step towards the desired path, at first.
-GAIN = 0.6
+# Gain of a step towards the desired path, at first, and by what it grows again with each better pass once it is less.
+GAIN, GROWING = 0.8, 1.3
 # What keeps the error where it is, as long as passes still make it smaller.
 NOT_YET = "not yet learned"
 # A pass is worse than the best from this ratio of their errors on, beyond this many standard deviations of the noise
@@ -251,7 +251,7 @@ class AxisLearner:
         self._returned = 0
         if best is None or power < best.power:
             if power < self.record - self._scatter():
-                self.returns = 0
+                self.returns, self.gain = 0, min(GROWING * self.gain, GAIN)
             self.record = min(self.record, power)
             self.best = _Best(number, power, self.correction, clean)
             return True
@@ -467,6 +467,9 @@ class AxisLearner:
                 "answered_m": _pairs(h.answered),
                 "scatter": h.scatter.tolist(),
                 "misfit": h.misfit.tolist(),
+                "innovation": _pairs(h.innovation),
+                "innovation_product": h.innovation_product.tolist(),
+                "innovation_square": h.innovation_square.tolist(),
                 "changed": h.changed.tolist(),
                 "answers": _pairs(h.answers),
                 "passes": h.passes,
@@ -515,6 +518,9 @@ class AxisLearner:
             answered=_complex(numbers["answered_m"]),
             scatter=np.array(numbers["scatter"]),
             misfit=np.array(numbers["misfit"]),
+            innovation=_complex(numbers["innovation"]),
+            innovation_product=np.array(numbers["innovation_product"]),
+            innovation_square=np.array(numbers["innovation_square"]),
             changed=np.array(numbers["changed"]),
             answers=_complex(numbers["answers"]),
             passes=numbers["passes"],

@@ -21,6 +21,9 @@ LEAST_GAIN = 0.1
 REST_SHARE, TURN_SHARE = 0.1, 0.02
 # Random walk of the repeating error from pass to pass, as a share of its noise (variance).
 ERROR_WALK = 0.02
+# The share of an innovation that is taken over grows by the correlation of successive ones beyond this, which noise may
+# have, up to this share; what is left of the correlation after another pass.
+CORRELATED, MOST_SHARE, REMEMBERED = 0.1, 0.8, 0.7
 # Share of an unexpected change, as in the neighbouring harmonics, that is taken for a change of the repeating error.
 CHANGED_SHARE, NEIGHBOURS = 0.2, 3
 # Share of the new estimate of what comes with a change of the path.
@@ -81,6 +84,10 @@ class Harmonics:
         multiple of the mean square of the change's harmonics.
     misfit : ndarray
         Variance of the gain by which the last changes were answered otherwise than expected.
+    innovation : ndarray of complex
+        Last unexpected part of a reading, in its expected standard deviations.
+    innovation_product, innovation_square : ndarray
+        Means, over the last passes, of the product of successive innovations and of their square.
     changed, answers : ndarray, and ndarray of complex
         What the changes of this harmonic alone say of its gain: information (an inverse variance), and its product with
         their estimate.
@@ -106,6 +113,9 @@ class Harmonics:
     answered: ComplexArray
     scatter: FloatArray
     misfit: FloatArray
+    innovation: ComplexArray
+    innovation_product: FloatArray
+    innovation_square: FloatArray
     changed: FloatArray
     answers: ComplexArray
     guessed: FloatArray
@@ -125,6 +135,9 @@ class Harmonics:
             none,
             np.zeros_like(noise),
             np.zeros_like(noise),
+            none,
+            np.zeros_like(noise),
+            np.ones_like(noise),
             np.zeros_like(noise),
             none,
             variance,
@@ -222,11 +235,17 @@ class Harmonics:
         answer = replace(answer, gain=joint, variance=joint_variance)
         own = own + scatter
         variance = own + CHANGED_SHARE * np.maximum(beyond - scatter, 0.0) + ERROR_WALK * self.noise
-        share = variance / (variance + noise)
+        innovation = unexpected / np.sqrt(np.maximum(own + noise, 1e-300))
+        innovation_product = _mean_with(self.innovation_product, (innovation * self.innovation.conj()).real)
+        innovation_square = _mean_with(self.innovation_square, np.abs(innovation) ** 2)
+        share = _share(
+            variance / (variance + noise), around(innovation_product) / np.maximum(around(innovation_square), 1e-300)
+        )
         now = at_last + gain * change + share * unexpected
         return replace(
-            found._at(correction, now, (1.0 - share) * variance, answer),
+            found._at(correction, now, share * noise, answer),
             noise=self._noise_after(np.abs(unexpected) ** 2, own + noise), scatter=scattered, misfit=misfit,
+            innovation=innovation, innovation_product=innovation_product, innovation_square=innovation_square,
             passes=self.passes + 1,
         )  # fmt: skip
 
@@ -267,6 +286,22 @@ class Harmonics:
         step = np.where(self.phase_known, step, np.where(worth, test, 0.0))
         step[0] = 0.0
         return step
+
+
+def _share(share: FloatArray, correlation: FloatArray) -> FloatArray:
+    """Return the share of innovations that a filter takes over, (K,), once their correlation shows it too small.
+
+    Innovations of an optimal filter are white. With a share K, those of a random walk in noise have the correlation
+    ``K_opt - K`` from one to the next, about (R. K. Mehra, On the identification of variances and adaptive Kalman
+    filtering, IEEE Trans. Autom. Control 15 (1970)).
+    """
+    more = share + np.maximum(correlation - CORRELATED, 0.0)
+    return np.asarray(np.minimum(more, np.maximum(share, MOST_SHARE)))
+
+
+def _mean_with(before: FloatArray, new: FloatArray) -> FloatArray:
+    """Return a mean over the last passes after another one."""
+    return np.asarray(REMEMBERED * before + (1.0 - REMEMBERED) * new)
 
 
 def around(power: FloatArray) -> FloatArray:

@@ -165,8 +165,8 @@ class Learner:
         remarks = []
         for name, axis in self.axes.items():
             learned = document["axes"][name]
-            # A file of an earlier version tells nothing of the dynamics.
-            same = learned["model"] == self._identity(name) and "dynamics" in learned
+            # A file of an earlier version tells nothing of the dynamics, or of the innovations.
+            same = learned["model"] == self._identity(name) and "innovation" in learned["harmonics"]
             try:
                 axis.resume(learned, same_model=same)
             except (ModelError, IndexError, KeyError, TypeError, ValueError) as error:

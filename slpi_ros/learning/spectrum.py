@@ -7,7 +7,7 @@ from slpi_ros.learning.harmonics import ComplexArray
 
 # A path closes if its ends differ by less than this many of its largest steps; otherwise it is led back to its
 # beginning over this share of it, and the correction begins and ends at 0, over this share.
-CLOSING_STEPS, LED_BACK, LEAST_LED_BACK, TAPER = 1.5, 0.25, 16, 0.02
+CLOSING_STEPS, LED_BACK, LEAST_LED_BACK, TAPER = 1.5, 0.25, 16, 0.005
 
 
 class PathSpectrum:

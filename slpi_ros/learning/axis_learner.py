@@ -18,7 +18,7 @@ from slpi_ros.learning.spectrum import PathSpectrum
 from slpi_ros.model.axis_model import AxisModel
 
 # Gain of a step towards the desired path, at first, and by what it grows again with each better pass once it is less.
-GAIN, GROWING = 0.8, 1.3
+GAIN, GROWING = 0.6, 1.3
 # What keeps the error where it is, as long as passes still make it smaller.
 NOT_YET = "not yet learned"
 # A pass is worse than the best from this ratio of their errors on, beyond this many standard deviations of the noise

@@ -117,6 +117,7 @@ class AxisLearner:
         self._lead_in: FloatArray | None = None
         self._returned = 0  # passes of the best path again, until it has settled
         self._settling = math.inf  # m^2, mean square error of the pass before
+        self._worst = 0.0  # m^2, largest mean square error of a pass from which learning went back
         self._history: list[Pass] = []
         self._undisturbed: Pass | None = None  # the second pass, from which on the path is changed
         noise = np.full(self.frequency.size, self.spectrum.size * max(axis.quality.floor_rms, 1e-12) ** 2)
@@ -234,6 +235,7 @@ class AxisLearner:
         self._lead_in = None
         self._deviating, self._last = judged.deviating, commanded
         steady, unsure = self._estimate(clean)
+        self._release(rms)
         if self._worth_a_step(clean, rms, steady, unsure) and not self.held:
             self._step()
 
@@ -282,6 +284,15 @@ class AxisLearner:
             self._give_up()
             return False
         return True
+
+    def _release(self, rms: float) -> None:
+        """Learn on, if the path as it was at first is by now worse than what learning was held for.
+
+        A mode near a harmonic of the path takes some passes to ring up: the first ones were better than any can be.
+        """
+        at_first = self.returns >= MOST_RETURNS and np.array_equal(self.correction, self._start)
+        if self.held and at_first and rms**2 > self._worst + self._scatter():
+            self.held, self.returns, self.best, self.record, self._returned = "", 0, None, math.inf, 0
 
     def _give_up(self) -> None:
         """Follow the path as it was at first: nothing that was learned is better."""
@@ -350,7 +361,7 @@ class AxisLearner:
         """Go back to the best pass with half the gain; the second time without a better one since, hold."""
         assert self.best is not None
         self.correction, self.gain, self.returns = self.best.correction, 0.5 * self.gain, self.returns + 1
-        self._returned, self._settling = 1, rms**2
+        self._returned, self._settling, self._worst = 1, rms**2, max(self._worst, rms**2)
         # What was learned of the last pass is not to make a riddle of the next one.
         self.harmonics = self.harmonics.at(self.spectrum.of(self.best.correction), self.spectrum.of(self.best.reading))
         self._told = f"{why}; back to the best, at half the gain"
@@ -440,6 +451,7 @@ class AxisLearner:
             "history": [one.to_document() for one in self._history],
             "dynamics": self.dynamics.to_document(),
             "returned": self._returned,
+            "worst_m2": self._worst,
             "settling_m2": self._settling if math.isfinite(self._settling) else None,
             "record_m2": self.record if math.isfinite(self.record) else None,
             "learn_limit_m": self.limit,
@@ -477,24 +489,40 @@ class AxisLearner:
             "passes": [asdict(one) for one in self.passes],
         }
 
+    def _check_sizes(self, document: Mapping[str, Any]) -> None:
+        """Raise ModelError if an array of a document is not one of this path."""
+        n, numbers, best = self.desired.size, document["harmonics"], document["best"] or {}
+        arrays = [(name, values, self.harmonics.noise.size) for name, values in numbers.items() if name != "passes"]
+        if not numbers["passes"]:
+            arrays = [one for one in arrays if one[0] != "without_variance_m2"]
+        arrays += [(name, document[name], n) for name in ("correction_m", "last_correction_m", "lead_in_m")]
+        arrays += [(name, best[name], n) for name in best if name in ("correction_m", "reading_m")]
+        passes = [*document["history"], *([document["undisturbed"]] if document["undisturbed"] else [])]
+        arrays += [(name, values, self.spectrum.size) for one in passes for name, values in one.items()]
+        for name, values, size in arrays:
+            found = np.zeros(size) if values is None else np.array(values, dtype=np.float64)
+            if found.shape[-1:] != (size,) or not np.isfinite(found).all():
+                raise ModelError(f"{name} is not {size} finite numbers; learn the path anew")
+
     def resume(self, document: Mapping[str, Any], *, same_model: bool) -> None:
         """Go on from a document of the same path; of another model, only the correction of the path is taken over."""
         correction = np.array(document["correction_m"])
         if correction.shape != self.desired.shape:
             raise ModelError(f"{correction.size} corrections for a path of {self.desired.size} samples; learn it anew")
+        if same_model:
+            self._check_sizes(document)
         low, high = -self.limit, self.limit
         self.correction = self._last = self._before = np.clip(correction, low, high)
         if not same_model:
             return
         numbers, h = document["harmonics"], self.harmonics
-        if len(numbers["noise_m2"]) != h.noise.size:
-            raise ModelError(f"{len(numbers['noise_m2'])} harmonics, not {h.noise.size}; learn the path anew")
         self._last, self._lead_in = np.array(document["last_correction_m"]), _array(document["lead_in_m"])
         self._history = [Pass.of(one) for one in document["history"]]
         self._undisturbed = document["undisturbed"] and Pass.of(document["undisturbed"])
         self.dynamics.resume(document["dynamics"])
         self._returned = document["returned"]
         self._settling = math.inf if document["settling_m2"] is None else document["settling_m2"]
+        self._worst = document.get("worst_m2", 0.0)
         self.record = math.inf if document["record_m2"] is None else document["record_m2"]
         self.gain, self.held = document["gain"], document["held"]
         self.returns, self.refused, self._offset = document["returns"], document["refused"], document["offset_m"]

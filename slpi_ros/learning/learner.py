@@ -170,7 +170,8 @@ class Learner:
             try:
                 axis.resume(learned, same_model=same)
             except (ModelError, IndexError, KeyError, TypeError, ValueError) as error:
-                raise ModelError(f"{source}: axis '{name}': {error}") from None
+                what = f"it has no {error}; learn the path anew" if isinstance(error, KeyError) else error
+                raise ModelError(f"{source}: axis '{name}': {what}") from None
             if not same:
                 why = "a file of an earlier version" if learned["model"] == self._identity(name) else "another model"
                 remarks.append(f"axis '{name}': {why}; learned anew, from the correction of the path so far")

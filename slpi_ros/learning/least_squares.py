@@ -56,6 +56,6 @@ def variance_of(a: ComplexArray, covariance: FloatArray) -> FloatArray:
 
 
 def _nearby(power: FloatArray) -> FloatArray:
-    window = np.ones(2 * NEARBY + 1)
+    window = np.ones(min(2 * NEARBY + 1, power.size))
     near: FloatArray = np.convolve(power, window, "same") / np.convolve(np.ones(power.size), window, "same")
     return near

@@ -444,6 +444,54 @@ def test_a_repeating_error_that_walks_is_followed_and_noise_is_not():
     assert far(1.0) < 1.6
 
 
+@pytest.mark.parametrize(("worst", "released"), [(0.5, True), (2.0, False)])
+def test_learning_goes_on_where_the_path_itself_is_worse_than_what_it_was_held_for(model, worst, released):
+    learner, stage, errors = learned(model, 2)
+    axis, t = learner.axes["x"], path()[0]
+    axis.held, axis.returns, axis.correction = "held: for a test", 2, np.zeros(t.size)
+    axis._worst = (worst * errors[-1]) ** 2
+    again = slpi_ros.Learner(model, *path())
+    assert again.resume(learner.to_document()) == []
+    again.update(stage.run(again.path())[1])
+    assert (again.axes["x"].held == "") == released
+    assert (again.axes["x"].returns == 0) == released
+
+
+def _change(document, place, change):
+    """Change the value at a place (keys) of a document."""
+    *way, last = place
+    for key in way:
+        document = document[key]
+    document[last] = change(document[last])
+
+
+@pytest.mark.parametrize(
+    "place",
+    [
+        ("last_correction_m",), ("best", "correction_m"), ("best", "reading_m"), ("harmonics", "gain_variance"),
+        ("harmonics", "innovation_square"), ("harmonics", "innovation_product"), ("undisturbed", "reading_m"),
+        ("history", 0, "commanded_m"), ("harmonics", "scatter"),
+    ],
+)  # fmt: skip
+@pytest.mark.parametrize("change", [lambda x: x[:-3], lambda _: [], lambda x: [float("nan"), *x[1:]]])
+def test_a_damaged_file_is_refused_and_changes_nothing(model, place, change):
+    document = learned(model, 4)[0].to_document()
+    _change(document["axes"]["x"], place, change)
+    learner = slpi_ros.Learner(model, *path())
+    before = learner.path()
+    with pytest.raises(ModelError):
+        learner.resume(document)
+    assert np.array_equal(learner.path(), before)
+
+
+def test_a_closed_path_of_few_samples_is_learned(model):
+    n, rng = 12, np.random.default_rng(2)
+    learner = slpi_ros.Learner(model, np.arange(n) / RATE, 10e-6 + 1e-6 * np.sin(2 * np.pi * np.arange(n) / n))
+    for _ in range(6):
+        report = learner.update(10e-6 + 0.9 * (learner.path() - 10e-6) + rng.normal(0.0, NOISE, n))
+    assert report.error < learner.passes["x"][0].error
+
+
 def test_the_gain_grows_again_with_better_passes(model):
     learner, stage, errors = learned(model, 3)
     learner.axes["x"].gain = 0.1

@@ -54,8 +54,9 @@ RECORDS_S = (4.0, 0.6)
 LINE = [(gain, band) for gain in (0.3, 0.6, 1.0) for band in (40.0, 100.0, 250.0)]
 PI = [(p, i) for p in (0.0, 0.2) for i in (20.0, 80.0, 250.0)]
 PATHS = ("raster 1", "raster 5", "raster 20", "raster 40", "raster f/10", "sine", "steps", "free")
-# Of steps: rise (s), time constants of the mode until they count, and how long they count then (s).
-RISE_S, SETTLING, COUNTED_S = 0.02, 5.0, 0.04
+# Of steps: levels, as shares of half the path; rise (s), time constants of the mode until they count, and how long they
+# count then (s).
+LEVELS, RISE_S, SETTLING, COUNTED_S = (0.6, -0.4, 0.9, -0.8, 0.0), 0.02, 5.0, 0.04
 # Share of the stroke that a path covers, and by what it is made smaller where the voltages would not leave room.
 SHARE, SMALLER, ROOM = 0.6, 0.8, 0.05
 
@@ -185,7 +186,7 @@ def _path_of(name: str, specimen: Specimen, axis: slpi_ros.AxisModel, share: flo
     middle, half = 0.5 * (low + high), 0.5 * share * (high - low)
     if name == "steps":
         rise, counted = round(RISE_S * RATE_HZ), round(COUNTED_S * RATE_HZ)
-        edges = np.repeat([0.6, -0.4, 0.9, -0.8, 0.0], rise + specimen.settling + counted)
+        edges = np.repeat(LEVELS, rise + specimen.settling + counted)
         window = np.hanning(rise + 1)
         return middle + half * np.convolve(np.pad(edges, (rise, 0), "wrap"), window / window.sum(), "valid")
     if name == "free":
@@ -255,9 +256,8 @@ def judged_of(name: str, specimen: Specimen, desired: FloatArray) -> FloatArray:
     """Return which samples count, (N,), 1 or 0: of steps, those five time constants of the mode after each."""
     judged = np.ones(desired.size)
     if name == "steps":
-        rise = round(RISE_S * RATE_HZ)
-        flat = desired.size // 5
-        judged = (np.arange(desired.size) % flat >= rise + specimen.settling).astype(float)
+        since_step = np.arange(desired.size) % (desired.size // len(LEVELS))
+        judged = (since_step >= round(RISE_S * RATE_HZ) + specimen.settling).astype(float)
     return judged
 
 

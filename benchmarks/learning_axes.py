@@ -6,12 +6,9 @@ import warnings
 from pathlib import Path
 
 import numpy as np
-from learning import RATE_HZ, Run, Specimen, identified, path_of, rms
-from numpy.typing import NDArray
+from learning import RATE_HZ, FloatArray, Run, Specimen, identified, path_of, rms
 
 import slpi_ros
-
-FloatArray = NDArray[np.float64]
 
 LINE = "raster 20"
 # Share of the motion of one axis in the displacement of the other.

@@ -495,24 +495,21 @@ class AxisLearner:
         arrays = [(name, values, self.harmonics.noise.size) for name, values in numbers.items() if name != "passes"]
         if not numbers["passes"]:
             arrays = [one for one in arrays if one[0] != "without_variance_m2"]
-        arrays += [(name, document[name], n) for name in ("correction_m", "last_correction_m", "lead_in_m")]
+        arrays += [(name, document[name], n) for name in ("last_correction_m", "lead_in_m")]
         arrays += [(name, best[name], n) for name in best if name in ("correction_m", "reading_m")]
         passes = [*document["history"], *([document["undisturbed"]] if document["undisturbed"] else [])]
         arrays += [(name, values, self.spectrum.size) for one in passes for name, values in one.items()]
         for name, values, size in arrays:
-            found = np.zeros(size) if values is None else np.array(values, dtype=np.float64)
-            if found.shape[-1:] != (size,) or not np.isfinite(found).all():
-                raise ModelError(f"{name} is not {size} finite numbers; learn the path anew")
+            if values is not None:
+                _check_size(name, values, size)
 
     def resume(self, document: Mapping[str, Any], *, same_model: bool) -> None:
         """Go on from a document of the same path; of another model, only the correction of the path is taken over."""
-        correction = np.array(document["correction_m"])
-        if correction.shape != self.desired.shape:
-            raise ModelError(f"{correction.size} corrections for a path of {self.desired.size} samples; learn it anew")
+        _check_size("correction_m", document["correction_m"], self.desired.size)
         if same_model:
             self._check_sizes(document)
         low, high = -self.limit, self.limit
-        self.correction = self._last = self._before = np.clip(correction, low, high)
+        self.correction = self._last = self._before = np.clip(document["correction_m"], low, high)
         if not same_model:
             return
         numbers, h = document["harmonics"], self.harmonics
@@ -522,7 +519,7 @@ class AxisLearner:
         self.dynamics.resume(document["dynamics"])
         self._returned = document["returned"]
         self._settling = math.inf if document["settling_m2"] is None else document["settling_m2"]
-        self._worst = document.get("worst_m2", 0.0)
+        self._worst = document["worst_m2"]
         self.record = math.inf if document["record_m2"] is None else document["record_m2"]
         self.gain, self.held = document["gain"], document["held"]
         self.returns, self.refused, self._offset = document["returns"], document["refused"], document["offset_m"]
@@ -553,6 +550,13 @@ class AxisLearner:
             answers=_complex(numbers["answers"]),
             passes=numbers["passes"],
         )
+
+
+def _check_size(name: str, values: Any, size: int) -> None:
+    """Raise ModelError if the last dimension of an array is of another size, or a value is not finite."""
+    found = np.array(values, dtype=np.float64)
+    if found.shape[-1:] != (size,) or not np.isfinite(found).all():
+        raise ModelError(f"{name} is not {size} finite numbers; learn the path anew")
 
 
 def _listed(x: FloatArray | None) -> list[float] | None:

@@ -1,4 +1,4 @@
-"""Paths that repeat on stages whose physics is not the model's: learning, beside feedforward, feedback, and another.
+"""Paths that repeat on stages whose physics is not the model's: learning, beside feedforward, feedback, and others.
 
 Each stage has hysteresis of ``hidden/foreign.py`` (thermally activated relays, Maxwell slip, moving Preisach), creep, a
 lag, a flexure mode of 150 to 900 Hz with damping 0.005 to 0.05, and drift; its sensor has 2 to 20 nm of noise. The
@@ -7,8 +7,9 @@ follows one path again and again:
 
 - ``feedforward``: the inverse alone;
 - ``PI``: the inverse and feedback with the best of several gains;
-- ``line``: the error of each pass is added to the path of the next one, low-passed without a phase, with the best of
-  several gains and bandwidths; this is what learning through a straight line reaches;
+- ``line``: a straight line in place of the inverse; the error of each pass is added to the path of the next one,
+  low-passed without a phase, with the best of several gains and bandwidths (as digital linearization does);
+- ``inverse``: the same through the inverse;
 - ``learner``: `slpi_ros.Learner`.
 
 Printed is the **true** error, rms in nm, without the mean of the pass: of the first pass, and after 5 and `--passes`
@@ -50,8 +51,9 @@ KINDS = {
 }
 # Duration (s) of the calibration records.
 RECORDS_S = (4.0, 0.6)
-# Gains and bandwidths (Hz) of the straight line; gains of the feedback, proportional and integral (1/s).
-LINE = [(gain, band) for gain in (0.3, 0.6, 1.0) for band in (40.0, 100.0, 250.0)]
+# Gains and bandwidths (Hz) of learning without a model of the dynamics; gains of the feedback, proportional and
+# integral (1/s).
+FIXED = [(gain, band) for gain in (0.3, 0.6, 1.0) for band in (40.0, 100.0, 250.0)]
 PI = [(p, i) for p in (0.0, 0.2) for i in (20.0, 80.0, 250.0)]
 PATHS = ("raster 1", "raster 5", "raster 20", "raster 40", "raster f/10", "sine", "steps", "free")
 # Of steps: levels, as shares of half the path; rise (s), time constants of the mode until they count, and how long they
@@ -204,10 +206,14 @@ def _path_of(name: str, specimen: Specimen, axis: slpi_ros.AxisModel, share: flo
 
 
 class Run:
-    """Passes of one path on one stage, through the inverse of the model."""
+    """Passes of one path on one stage, through the inverse of the model, or through a straight line."""
 
-    def __init__(self, specimen: Specimen, axis: slpi_ros.AxisModel, desired: FloatArray) -> None:
+    def __init__(
+        self, specimen: Specimen, axis: slpi_ros.AxisModel, desired: FloatArray, *, straight: bool = False
+    ) -> None:
         self.specimen, self.desired, self.stage = specimen, desired, Stage(specimen)
+        self.range = axis.displacement_range
+        self._line = (self.range, axis.voltage_range) if straight else None
         self.stream = axis.stream(start_memory="start")
         self._noise = np.random.default_rng([3, specimen.seed])
         self._at = 0.0
@@ -219,9 +225,12 @@ class Run:
     def follow(self, path: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Return voltage (V), true and measured displacement (m), (N,), for a path (m, (N,))."""
         v = np.empty(path.size)
-        for k, y in enumerate(path.tolist()):
-            self._at += 1.0 / RATE_HZ
-            v[k] = self.stream.step(self._at, y)
+        if self._line:
+            v = np.interp(path, *self._line)
+        else:
+            for k, y in enumerate(path.tolist()):
+                self._at += 1.0 / RATE_HZ
+                v[k] = self.stream.step(self._at, y)
         x = self.stage.run(v)
         return v, x, x + self.specimen.noise * self._noise.standard_normal(x.size)
 
@@ -261,6 +270,19 @@ def judged_of(name: str, specimen: Specimen, desired: FloatArray) -> FloatArray:
     return judged
 
 
+def without_dynamics(run: Run, judged: FloatArray, gain: float, band: float, passes: int) -> list[float]:
+    """Return the true error (nm) of every pass, if the error of each is added to the path of the next one."""
+    size, correction, found = run.desired.size, np.zeros(run.desired.size), []
+    low_pass = np.exp(-0.5 * (np.fft.rfftfreq(size, 1.0 / RATE_HZ) / band) ** 2)
+    low_pass[0] = 0.0
+    for _ in range(passes):
+        _, x, y = run.follow(np.clip(run.desired + correction, *run.range))
+        run.back()
+        found.append(rms(x, run.desired, judged))
+        correction = correction + gain * np.fft.irfft(np.fft.rfft(run.desired - y) * low_pass, size)
+    return found
+
+
 def compare(
     specimen: Specimen, axis: slpi_ros.AxisModel, name: str, passes: int, beside: bool
 ) -> dict[str, list[float]]:
@@ -284,18 +306,12 @@ def compare(
         run.back()
     if not beside:
         return errors
-    tried: list[list[float]] = []
-    for gain, band in LINE:
-        run, correction, found = Run(specimen, axis, desired), np.zeros(desired.size), []
-        low_pass = np.exp(-0.5 * (np.fft.rfftfreq(desired.size, 1.0 / RATE_HZ) / band) ** 2)
-        low_pass[0] = 0.0
-        for _ in range(passes):
-            _, x, y = run.follow(np.clip(desired + correction, *axis.displacement_range))
-            run.back()
-            found.append(rms(x, desired, judged))
-            correction = correction + gain * np.fft.irfft(np.fft.rfft(desired - y) * low_pass, desired.size)
-        tried.append(found)
-    errors["line"] = min(tried, key=lambda found: found[-1])
+    for method in ("line", "inverse"):
+        tried = [
+            without_dynamics(Run(specimen, axis, desired, straight=method == "line"), judged, gain, band, passes)
+            for gain, band in FIXED
+        ]
+        errors[method] = min(tried, key=lambda found: found[-1])
     tried = []
     for proportional, integral in PI:
         run = Run(specimen, axis, desired)
@@ -312,10 +328,10 @@ def keep(specimen: Specimen, seed: int, passes: int, errors: Mapping[str, Any]) 
         f"a path that repeats, on a simulated stage of another physics ({specimen.kind}, a mode of "
         f"{specimen.frequency:.0f} Hz with a damping of {specimen.damping:.3f}, {1e9 * specimen.noise:.1f} nm of "
         "sensor noise): true error on a raster of 20 Hz with the inverse alone; with PI feedback; after "
-        f"{passes} passes of learning through a straight line; of `learn` (where a mode was not identified, tens of "
-        "nanometres may stay)"
+        f"{passes} passes of learning without a model of the dynamics, through a straight line and through the "
+        "inverse; of `learn` (where a mode was not identified, tens of nanometres may stay)"
     )
-    figures = errors["learner"][0], errors["PI"][-1], errors["line"][-1], errors["learner"][-1]
+    figures = [errors["learner"][0], *(errors[each][-1] for each in ("PI", "line", "inverse", "learner"))]
     said = "; ".join(f"{one:.1f} nm" for one in figures)
     kept.write_row("learning", what, said, f'make bench-learning LEARNING="--seed {seed} --count 1"')
 
@@ -335,7 +351,8 @@ def main() -> int:
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     print(f"true error, rms nm, without mean; after 5 and {options.passes} passes")
-    print(f"{'stage':<34}{'path':<12}{'noise':>6}{'first':>8}{'PI':>8}{'line 5':>8}{'last':>8}{'own 5':>10}{'last':>8}")
+    print(f"{'stage':<34}{'path':<12}{'noise':>6}{'first':>8}{'PI':>8}"
+          f"{'line 5':>8}{'last':>8}{'inv. 5':>8}{'last':>8}{'own 5':>10}{'last':>8}")  # fmt: skip
     counts = {"NOISE": 0, "TENTH": 0, "LINE": 0, "HARM": 0, "HARM (alone too)": 0}
     rows = 0
     for seed in range(options.seed, options.seed + options.count):
@@ -348,13 +365,13 @@ def main() -> int:
               f"  ({time.perf_counter() - began:.0f} s)", flush=True)  # fmt: skip
         for name in PATHS if options.all_paths else options.paths:
             errors = compare(specimen, axis, name, options.passes, not options.alone)
-            own, line, noise = errors["learner"], errors.get("line"), 1e9 * specimen.noise
+            own, noise, fifth = errors["learner"], 1e9 * specimen.noise, min(5, options.passes - 1)
             marks = []
             if own[-1] > noise:
                 marks.append("NOISE")
             if own[-1] > max(0.1 * own[0], noise):
                 marks.append("TENTH")
-            if line and own[min(5, len(own) - 1)] > max(line[min(5, len(line) - 1)] / 3.0, noise):
+            if not options.alone and own[fifth] > max(errors["line"][fifth] / 3.0, noise):
                 marks.append("LINE")
             if max(own) > 1.1 * max(own[0], noise):
                 marks.append("HARM")
@@ -366,9 +383,10 @@ def main() -> int:
             rows += 1
             if options.keep and name == "raster 20" and seed == options.seed:
                 keep(specimen, seed, options.passes, errors)
-            fifth = f"{line[min(5, len(line) - 1)]:>8.1f}{line[-1]:>8.1f}" if line else f"{'':>16}"
-            print(f"{'':<34}{name:<12}{noise:>6.1f}{own[0]:>8.1f}{errors.get('PI', [math.nan])[-1]:>8.1f}{fifth}"
-                  f"{own[min(5, len(own) - 1)]:>10.1f}{own[-1]:>8.1f}  {errors['limited'][0]}"
+            others = [errors.get(method, [math.nan] * options.passes) for method in ("line", "inverse")]
+            beside = "".join(f"{each[fifth]:>8.1f}{each[-1]:>8.1f}" for each in others)
+            print(f"{'':<34}{name:<12}{noise:>6.1f}{own[0]:>8.1f}{errors.get('PI', [math.nan])[-1]:>8.1f}{beside}"
+                  f"{own[fifth]:>10.1f}{own[-1]:>8.1f}  {errors['limited'][0]}"
                   f" {errors['bandwidth'][0]:.0f} Hz"
                   f"  {' '.join(marks)}", flush=True)  # fmt: skip
     print("; ".join(f"{mark} {count} of {rows}" for mark, count in counts.items()))

@@ -179,7 +179,7 @@ class AxisLearner:
         judged = judge(seen, expected, spread, floor, self._deviating, error)
         if self._lead_in is not None and not judged.reason:
             judged = agreed(self._lead_in, judged, self.desired, floor)
-        reason = unusable or self._replayed(measured) or judged.reason
+        reason = unusable or self._replayed(measured, commanded) or judged.reason
         if not reason and voltage is not None and (reason := held_back(voltage, self.voltage)):
             self._clipped = "voltage range"
         offset, drift = self._offset_and_drift(judged, expected, first=first)
@@ -403,9 +403,9 @@ class AxisLearner:
         unknown = np.flatnonzero(~self.harmonics.phase_known[1:]) + 1
         return float(self.frequency[unknown[0] if unknown.size else -1])
 
-    def forget(self) -> None:
-        """Begin anew from the desired path."""
-        self.__init__(self.axis, self.dt, self.desired, self.limit, self.voltage)  # type: ignore[misc]
+    def anew(self) -> "AxisLearner":
+        """Return what begins anew from the desired path."""
+        return AxisLearner(self.axis, self.dt, self.desired, self.limit, self.voltage)
 
     def _scatter(self) -> float:
         """Return by how much (m^2) the mean square error of a pass may differ by its noise."""
@@ -429,13 +429,17 @@ class AxisLearner:
         moved = offset - self._offset
         return offset, math.copysign(min(abs(slope), abs(moved)), moved) if slope * moved > 0.0 else 0.0
 
-    def _replayed(self, measured: FloatArray) -> str:
+    def _replayed(self, measured: FloatArray, commanded: FloatArray) -> str:
         """Return that a pass is the copy of an earlier one, although another path was commanded; "" if not."""
         known = hashlib.sha256(np.ascontiguousarray(measured).tobytes()).hexdigest()
-        path = hashlib.sha256(self.path.tobytes()).hexdigest()
+        path = hashlib.sha256(commanded.tobytes()).hexdigest()
         earlier = [each.split(":")[1] for each in self._hashes if each.startswith(known)]
         self._hashes = [*self._hashes, f"{known}:{path}"][-KEPT_HASHES:]
-        if any(each != path for each in earlier):
+        # Steps of the sensor that are larger than its noise and than the change of the path hide the change.
+        steps = np.diff(np.unique(measured[np.isfinite(measured)]))
+        step = float(steps.min()) if steps.size else 0.0
+        hidden = step > max(self.noise, float(np.abs(commanded - self._last).max()))
+        if any(each != path for each in earlier) and not hidden:
             return "every reading is that of an earlier pass: the sensor's data are replayed"
         return ""
 
@@ -446,6 +450,8 @@ class AxisLearner:
             "desired_m": self.desired.tolist(),
             "correction_m": self.correction.tolist(),
             "last_correction_m": self._last.tolist(),
+            "before_m": self._before.tolist(),
+            "clipped": self._clipped,
             "lead_in_m": _listed(self._lead_in),
             "undisturbed": self._undisturbed and self._undisturbed.to_document(),
             "history": [one.to_document() for one in self._history],
@@ -495,7 +501,7 @@ class AxisLearner:
         arrays = [(name, values, self.harmonics.noise.size) for name, values in numbers.items() if name != "passes"]
         if not numbers["passes"]:
             arrays = [one for one in arrays if one[0] != "without_variance_m2"]
-        arrays += [(name, document[name], n) for name in ("last_correction_m", "lead_in_m")]
+        arrays += [(name, document[name], n) for name in ("last_correction_m", "before_m", "lead_in_m")]
         arrays += [(name, best[name], n) for name in best if name in ("correction_m", "reading_m")]
         passes = [*document["history"], *([document["undisturbed"]] if document["undisturbed"] else [])]
         arrays += [(name, values, self.spectrum.size) for one in passes for name, values in one.items()]
@@ -508,11 +514,12 @@ class AxisLearner:
         _check_size("correction_m", document["correction_m"], self.desired.size)
         if same_model:
             self._check_sizes(document)
-        low, high = -self.limit, self.limit
-        self.correction = self._last = self._before = np.clip(document["correction_m"], low, high)
+        self.correction = self._last = np.clip(document["correction_m"], -self.limit, self.limit)
+        self._before = self._last if not same_model else np.clip(document["before_m"], -self.limit, self.limit)
         if not same_model:
             return
         numbers, h = document["harmonics"], self.harmonics
+        self._clipped = document["clipped"]
         self._last, self._lead_in = np.array(document["last_correction_m"]), _array(document["lead_in_m"])
         self._history = [Pass.of(one) for one in document["history"]]
         self._undisturbed = document["undisturbed"] and Pass.of(document["undisturbed"])

@@ -134,8 +134,7 @@ class Learner:
 
     def forget(self) -> None:
         """Begin anew from the desired path."""
-        for axis in self.axes.values():
-            axis.forget()
+        self.axes = {name: axis.anew() for name, axis in self.axes.items()}
 
     def to_document(self) -> dict[str, Any]:
         """Return what was learned as a JSON document (schema ``learned``), with the identity of path and model."""
@@ -151,7 +150,7 @@ class Learner:
         """Go on from a document of the same stage and path; return remarks.
 
         Of another model, learning begins anew from the correction of the path. ModelError, which begins with `source`,
-        if the document is not valid, or of another stage or path.
+        if the document is not valid, or of another stage or path; then nothing of it is taken over.
         """
         validate(document, "learned", source)
         if document["hardware_id"] != self.model.hardware_id:
@@ -162,11 +161,11 @@ class Learner:
         own = path_identity(self.t, {name: axis.desired for name, axis in self.axes.items()})
         if document["path"] != own or document["axes"].keys() != self.axes.keys():
             raise ModelError(f"{source}: learned for another path; give the file of this path, or learn it anew")
-        remarks = []
-        for name, axis in self.axes.items():
+        remarks, axes = [], {name: axis.anew() for name, axis in self.axes.items()}
+        for name, axis in axes.items():
             learned = document["axes"][name]
             # A file of an earlier version tells nothing of the dynamics, or of the innovations.
-            same = learned["model"] == self._identity(name) and "innovation" in learned["harmonics"]
+            same = learned["model"] == self._identity(name) and "before_m" in learned
             try:
                 axis.resume(learned, same_model=same)
             except (ModelError, IndexError, KeyError, TypeError, ValueError) as error:
@@ -175,6 +174,7 @@ class Learner:
             if not same:
                 why = "a file of an earlier version" if learned["model"] == self._identity(name) else "another model"
                 remarks.append(f"axis '{name}': {why}; learned anew, from the correction of the path so far")
+        self.axes = axes
         return remarks
 
     def save(self, path: str | os.PathLike[str]) -> None:

@@ -190,6 +190,23 @@ def test_a_replayed_pass_is_found(model):
     assert "replayed" in report.reason
 
 
+@pytest.mark.parametrize("replayed", [False, True])
+def test_readings_of_a_coarse_sensor_may_be_the_same(model, replayed):
+    """A sensor whose steps are larger than its noise does not see small changes of the path."""
+    t, desired = path()
+    learner, step = slpi_ros.Learner(model, t, desired), 50e-9
+    axis = learner.axes["x"]
+    read = desired + 0.1 * (desired - desired.mean())
+    first = np.round(read / step) * step
+    for _ in range(3):
+        learner.update(first)
+    moved = learner.path() + (400e-9 if replayed else 4e-9) * np.sin(2 * np.pi * 3 * t / t[-1])
+    axis.harmonics = replace(axis.harmonics, noise=np.full(axis.frequency.size, t.size * (5e-9) ** 2))
+    axis._last = axis.path - desired
+    report = learner.update(first, followed=moved)
+    assert ("replayed" in report.reason) == replayed
+
+
 @pytest.mark.parametrize("size", [40e-9, 400e-9, 4e-6])
 @pytest.mark.parametrize("width", [1, 6])
 def test_a_bump_within_a_pass_is_not_learned(model, size, width):
@@ -470,7 +487,7 @@ def _change(document, place, change):
     [
         ("last_correction_m",), ("best", "correction_m"), ("best", "reading_m"), ("harmonics", "gain_variance"),
         ("harmonics", "innovation_square"), ("harmonics", "innovation_product"), ("undisturbed", "reading_m"),
-        ("history", 0, "commanded_m"), ("harmonics", "scatter"),
+        ("history", 0, "commanded_m"), ("harmonics", "scatter"), ("before_m",),
     ],
 )  # fmt: skip
 @pytest.mark.parametrize("change", [lambda x: x[:-3], lambda _: [], lambda x: [float("nan"), *x[1:]]])
@@ -482,6 +499,36 @@ def test_a_damaged_file_is_refused_and_changes_nothing(model, place, change):
     with pytest.raises(ModelError):
         learner.resume(document)
     assert np.array_equal(learner.path(), before)
+
+
+def test_nothing_is_taken_over_where_one_axis_is_damaged(model):
+    axis = model.axes["x"]
+    t, desired = path()
+    learner = slpi_ros.Learner(slpi_ros.StageModel({"x": axis, "y": axis}), t, {"x": desired, "y": desired})
+    rng = np.random.default_rng(1)
+    for _ in range(3):
+        learner.update({name: 1.01 * y + rng.normal(0.0, NOISE, t.size) for name, y in learner.path().items()})
+    document, fresh = learner.to_document(), slpi_ros.Learner(learner.model, t, {"x": desired, "y": desired})
+    damaged = json.loads(json.dumps(document))
+    damaged["axes"]["y"]["harmonics"]["scatter"] = []
+    with pytest.raises(ModelError, match="'y'"):
+        fresh.resume(damaged)
+    assert not any(fresh.passes.values())
+    assert all(np.array_equal(y, desired) for y in fresh.path().values())
+    # What was there before is not mixed with it.
+    fresh.update({"x": desired, "y": desired})
+    assert fresh.resume(document) == [] and fresh.to_document() == document
+
+
+def test_a_change_goes_on_after_a_restart_without_a_jump(model):
+    mode = Resonance(modes=(Mode(frequency=223.0, damping=0.01, gain=1.0),))
+    told = slpi_ros.StageModel({"x": replace(model.axes["x"], effects=(mode,))})
+    learner, _, _ = learned(told, 3)
+    again = slpi_ros.Learner(told, *path())
+    assert again.resume(learner.to_document()) == []
+    axis = learner.axes["x"]
+    assert np.abs(axis.correction - axis._before).max() > 0.0
+    assert np.array_equal(again.path(), learner.path())
 
 
 def test_a_closed_path_of_few_samples_is_learned(model):

@@ -2,8 +2,9 @@
 
 Each stage has hysteresis of ``hidden/foreign.py`` (thermally activated relays, Maxwell slip, moving Preisach), creep, a
 lag, a flexure mode of 150 to 900 Hz with damping 0.005 to 0.05, and drift; its sensor has 2 to 20 nm of noise. The
-model is identified from records of its own, with what ``slpi diagnose`` finds; nothing of the stage is given. Then it
-follows one path again and again:
+model is identified from records of its own (two calibrations, and the drive that shows a resonance, as the how-to of
+paths that repeat asks for), with what ``slpi diagnose`` finds; nothing of the stage is given. Then it follows one path
+again and again:
 
 - ``feedforward``: the inverse alone;
 - ``PI``: the inverse and feedback with the best of several gains;
@@ -37,7 +38,7 @@ from numpy.typing import NDArray
 from scipy.signal import cont2discrete, lfilter
 
 import slpi_ros
-from slpi_ros.excitation.drives import calibration_drive
+from slpi_ros.excitation.drives import CALIBRATION, excite
 from slpi_ros.io.record import Record
 
 FloatArray = NDArray[np.float64]
@@ -46,11 +47,12 @@ RATE_HZ, HIGHEST_V = 4000.0, 100.0
 KINDS = {
     "relays": foreign.ThermalRelays(relays=900),
     "Maxwell": foreign.MaxwellSlip(),
-    # Less than a nanometre each: those that switch at the edge of a path are not the same in every pass.
-    "Preisach": foreign.MovingPreisach(relays=30_000),
+    # Those that switch at the turns of a path are not the same in every pass, and make a light mode ring: of a few
+    # thousand, by more than the noise of a good sensor.
+    "Preisach": foreign.MovingPreisach(relays=120_000),
 }
-# Duration (s) of the calibration records.
-RECORDS_S = (4.0, 0.6)
+# Drives of the records that a stage is identified from, and their durations (s).
+RECORDS = ((CALIBRATION, 4.0), (CALIBRATION, 0.6), ("resonance", 2.0))
 # Gains and bandwidths (Hz) of learning without a model of the dynamics; gains of the feedback, proportional and
 # integral (1/s).
 FIXED = [(gain, band) for gain in (0.3, 0.6, 1.0) for band in (40.0, 100.0, 250.0)]
@@ -157,8 +159,12 @@ def identified(specimen: Specimen, kept: Path | None) -> slpi_ros.StageModel:
 def records_of(specimen: Specimen) -> list[Record]:
     """Return the records from which a stage is identified."""
     noise, records = np.random.default_rng([7, specimen.seed]), []
-    for number, duration in enumerate(RECORDS_S):
-        v = calibration_drive(0.0, HIGHEST_V, duration=duration, rate=RATE_HZ, seed=10 * specimen.seed + number)[1]
+    for number, (drive, duration) in enumerate(RECORDS):
+        driven = excite(
+            voltage_min=0.0, voltage_max=HIGHEST_V, duration=duration, rate=RATE_HZ, seed=10 * specimen.seed + number,
+            drive=drive,
+        )  # fmt: skip
+        v = driven.voltage["x"]
         x = Stage(specimen).run(v)
         time_ns = np.round((3600.0 * number + np.arange(v.size) / RATE_HZ) * 1e9).astype(np.int64)
         y = x + specimen.noise * noise.standard_normal(x.size)

@@ -44,6 +44,9 @@ ANSWER = 5.0
 # A change of a path that closes comes in without a jump, which an identified mode would answer to: over this many of
 # its periods, and at most this share of the pass.
 ONSET_PERIODS, ONSET = 5.0, 0.25
+# The path is not changed before the third pass, or where identified modes ring on from pass to pass, until so many of
+# their time constants have passed: an error that still grows would be blamed on what was changed. Most such passes.
+RUNG_UP, MOST_UNCHANGED = 2.0, 4
 # A path that is followed is the one asked for within this (m).
 SAME_PATH = 1e-13
 # A harmonic's error counts beyond this many standard deviations.
@@ -111,8 +114,11 @@ class AxisLearner:
         self._offset: float | None = None
         self._hashes: list[str] = []
         self._clipped = self._told = ""
-        slowest = max((ONSET_PERIODS / hertz for hertz, _ in ringing(axis)), default=0.0)
+        modes, duration = ringing(axis), desired.size * dt
+        slowest = max((ONSET_PERIODS / hertz for hertz, _ in modes), default=0.0)
         rising = max(1.0, min(ONSET * desired.size, slowest / dt))
+        longest = max((time for _, time in modes), default=0.0) if self.spectrum.closed else 0.0
+        self._unchanged = int(np.clip(math.ceil(RUNG_UP * longest / duration) + 1, 2, MOST_UNCHANGED))
         self._onset = 0.5 - 0.5 * np.cos(np.pi * np.minimum((np.arange(desired.size) + (rising == 1.0)) / rising, 1.0))
         self._lead_in: FloatArray | None = None
         self._returned = 0  # passes of the best path again, until it has settled
@@ -236,6 +242,9 @@ class AxisLearner:
         self._deviating, self._last = judged.deviating, commanded
         steady, unsure = self._estimate(clean)
         self._release(rms)
+        if len(self.passes) + 1 < self._unchanged:
+            self._told = "the path as it is: its modes are still ringing up"
+            return
         if self._worth_a_step(clean, rms, steady, unsure) and not self.held:
             self._step()
 
@@ -321,7 +330,7 @@ class AxisLearner:
     @property
     def _harm(self) -> float:
         """Mean square error (m^2) of a pass from which on it is worse than the first ones were."""
-        return max((WORSE * one.error for one in self.passes[:2] if one.learned), default=math.inf) ** 2
+        return max((WORSE * one.error for one in self.passes[: self._unchanged] if one.learned), default=math.inf) ** 2
 
     def _estimate(self, clean: FloatArray) -> tuple[float, float]:
         """Learn the dynamics and the harmonics from a pass.

@@ -404,14 +404,15 @@ class MovingPreisach:
         growth, slope = _specimen(rng, self.width_growth), _specimen(rng, self.bias_slope)
         up, down, weights = _density(self.relays, width, growth, slope)
         weights = share * weights / _within(up, down, weights)
-        gain, state, felt = (1.0 - share) / 100.0, np.zeros(up.size, dtype=np.bool_), np.zeros(1)
-        # The first sample settles at once.
-        moved(np.array([np.inf]), np.array([v0]), state, felt, up, down, weights, gain, 100.0 * moving, settling)
+        gain, state = (1.0 - share) / 100.0, np.zeros(up.size, dtype=np.bool_)
+        place, felt, order = np.zeros(2, dtype=np.intp), np.zeros(2), (np.argsort(up), np.argsort(down))
 
         def continued(durations: FloatArray, v: FloatArray) -> FloatArray:
-            z = moved(durations, v, state, felt, up, down, weights, gain, 100.0 * moving, settling)
+            z = moved(durations, v, state, place, felt, up, down, *order, weights, gain, 100.0 * moving, settling)
             return np.asarray(self.stroke * z)
 
+        # The first sample settles at once.
+        continued(np.array([np.inf]), np.array([v0]))
         return continued
 
 
@@ -565,9 +566,12 @@ def moved(
     durations: FloatArray,
     v: FloatArray,
     state: NDArray[np.bool_],
+    place: NDArray[np.intp],
     felt: FloatArray,
     up: FloatArray,
     down: FloatArray,
+    rising: NDArray[np.intp],
+    falling: NDArray[np.intp],
     weights: FloatArray,
     gain: float,
     moving: float,
@@ -575,8 +579,9 @@ def moved(
 ) -> FloatArray:
     """Return the displacement of the moving Preisach model, shape (N,), in strokes.
 
-    `state`, shape (M,), whether each relay is up, and `felt`, shape (1,), the displacement (strokes) that acts back,
-    are modified.
+    Only the relays whose thresholds the effective voltage crosses are looked at. `state`, shape (M,), whether each
+    relay is up; `place`, shape (2,), the number of relays whose upper and whose lower threshold has been crossed; and
+    `felt`, shape (2,), the displacement that acts back and that of the relays (strokes), are modified.
 
     Parameters
     ----------
@@ -585,6 +590,8 @@ def moved(
     v : ndarray, shape (N,), volts
     up, down : ndarray, shape (M,), volts
         Thresholds of the relays.
+    rising, falling : ndarray of int, shape (M,)
+        Relays in the order of their upper and of their lower thresholds.
     weights : ndarray, shape (M,), strokes
     gain : float, 1/V
         Linear part, strokes per volt.
@@ -594,15 +601,26 @@ def moved(
         Time constant with which the displacement acts back.
     """
     out = np.empty_like(v)
+    above, below = place[0], place[1]
     for n in range(v.size):
-        field, total = v[n] + moving * felt[0], gain * v[n]
-        for k in range(up.size):
-            if field >= up[k]:
-                state[k] = True
-            elif field <= down[k]:
-                state[k] = False
+        field = v[n] + moving * felt[0]
+        while above > 0 and up[rising[above - 1]] > field:
+            above -= 1
+        while below > 0 and down[falling[below - 1]] >= field:
+            below -= 1
+            k = falling[below]
             if state[k]:
-                total += weights[k]
-        out[n] = total
-        felt[0] = total + (felt[0] - total) * math.exp(-durations[n] / settling)
+                state[k] = False
+                felt[1] -= weights[k]
+        while above < up.size and up[rising[above]] <= field:
+            k = rising[above]
+            above += 1
+            if not state[k]:
+                state[k] = True
+                felt[1] += weights[k]
+        while below < down.size and down[falling[below]] < field:
+            below += 1
+        out[n] = gain * v[n] + felt[1]
+        felt[0] = out[n] + (felt[0] - out[n]) * math.exp(-durations[n] / settling)
+    place[0], place[1] = above, below
     return out

@@ -18,7 +18,7 @@ from slpi_ros.learning.spectrum import PathSpectrum
 from slpi_ros.model.axis_model import AxisModel
 
 # Gain of a step towards the desired path, at first, and by what it grows again with each better pass once it is less.
-GAIN, GROWING = 0.6, 1.3
+GAIN, GROWING = 0.8, 1.3
 # What keeps the error where it is, as long as passes still make it smaller.
 NOT_YET = "not yet learned"
 # A pass is worse than the best from this ratio of their errors on, beyond this many standard deviations of the noise
@@ -46,7 +46,7 @@ ANSWER = 5.0
 ONSET_PERIODS, ONSET = 5.0, 0.25
 # The path is not changed before the third pass, or where identified modes ring on from pass to pass, until so many of
 # their time constants have passed: an error that still grows would be blamed on what was changed. Most such passes.
-RUNG_UP, MOST_UNCHANGED = 2.0, 4
+RUNG_UP, MOST_UNCHANGED = 2.0, 3
 # A path that is followed is the one asked for within this (m).
 SAME_PATH = 1e-13
 # A harmonic's error counts beyond this many standard deviations.

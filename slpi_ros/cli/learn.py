@@ -64,7 +64,8 @@ def _run(options: Namespace) -> Result:
         t, columns = read_table(options.desired, "m")
         desired = t, common.model_columns(columns, model, options.desired)
     limit = None if options.learn_limit is None else 1e-6 * options.learn_limit
-    done = learn(LearnRequest(common.source_of(options), model, desired, options.period, before, limit))
+    file = options.learned or ""
+    done = learn(LearnRequest(common.source_of(options), model, desired, options.period, before, limit, file))
     learner = done.learner
     options.remarks += done.remarks
     options.remarks += allow_table(options.output, table_header(learner.axes, "m"), overwrite=options.overwrite)

@@ -27,8 +27,8 @@ WORSE, WORSE_BY_NOISE, UNSURE = 1.1, 4.0, 3.0
 # Times that learning goes back to the best pass without a better one since, and passes in a row that cannot be learned
 # from, until it is held.
 MOST_RETURNS, MOST_REFUSED = 2, 3
-# How a text begins that says why learning is held.
-HELD = "held"
+# How a text begins and ends that says why learning is held.
+HELD, ANEW = "held", "forget what was learned to begin anew"
 # Passes after which the best one is forgotten, as the stage is another one by then.
 BEST_PASSES = 50
 # Largest part of the stroke that learning may add to the desired path, by default.
@@ -185,9 +185,11 @@ class AxisLearner:
         judged = judge(seen, expected, spread, floor, self._deviating, error)
         if self._lead_in is not None and not judged.reason:
             judged = agreed(self._lead_in, judged, self.desired, floor)
-        reason = unusable or self._replayed(measured, commanded) or judged.reason
-        if not reason and voltage is not None and (reason := held_back(voltage, self.voltage)):
+        # What a limit held back, or was not used for another reason, tells nothing of the sensor.
+        known = unusable or self._replayed(measured, commanded)
+        if not known and voltage is not None and (known := held_back(voltage, self.voltage)):
             self._clipped = "voltage range"
+        reason = known or judged.reason
         offset, drift = self._offset_and_drift(judged, expected, first=first)
         clean = judged.measured - offset - drift * (np.arange(measured.size) / measured.size - 0.5)
         rest = (clean - self.desired)[np.isfinite(clean)]
@@ -195,7 +197,7 @@ class AxisLearner:
         rms, absolute = (float(np.sqrt(np.mean(x**2))) if x.size else 0.0 for x in (rest, whole))
         self._remember(commanded, None if reason else clean)
         if reason:
-            self._refuse(reason, new=bool((commanded != self._last).any()))
+            self._refuse(reason, new=bool((commanded != self._last).any()), answered=not known)
         else:
             self._learn(commanded, clean, judged, rms)
             self._offset = offset
@@ -346,7 +348,10 @@ class AxisLearner:
         aim = self.spectrum.whole(self.correction)
         answer = self.dynamics.answer(Measured(self._history, aim, begun, path, rest, h.noise, h.of_hysteresis))
         settled = seen - answer.transient
-        self.harmonics = h.after(correction, settled, answer) if h.passes else h.begun(correction, settled, answer)
+        if h.passes:
+            self.harmonics = h.after(correction, settled, answer)
+        else:
+            self.harmonics = h.begun(correction, settled, answer, path, rest)
         power = self.spectrum.power
         return power(np.abs(self.wanted - settled) ** 2), power(answer.transient_variance)
 
@@ -375,16 +380,25 @@ class AxisLearner:
         self.harmonics = self.harmonics.at(self.spectrum.of(self.best.correction), self.spectrum.of(self.best.reading))
         self._told = f"{why}; back to the best, at half the gain"
         if self.returns >= MOST_RETURNS:
-            self.held = f"{HELD}: {why}, for the second time"
+            self.held = f"{HELD}: {why}, for the second time; {ANEW}"
 
-    def _refuse(self, reason: str, *, new: bool) -> None:
-        """Leave a pass alone, and go back to the best path from a new one; after several in a row, hold."""
+    def _refuse(self, reason: str, *, new: bool, answered: bool) -> None:
+        """Leave a pass alone, and go back to the best path from a new one; after several in a row, hold.
+
+        `answered`: it is refused as its readings are no answer to what was commanded. They may still be one, of a mode
+        that nobody knows of, so that a new path is to blame as if it were worse.
+        """
         self._told = reason
         self.refused += 1
         if self.best is not None and (new or self.refused >= MOST_REFUSED):
             self.correction, self._returned, self._settling = self.best.correction, 1, math.inf
+            if answered:
+                self.gain, self.returns = 0.5 * self.gain, self.returns + 1
+                if self.returns >= MOST_RETURNS:
+                    self.held = f"{HELD}: {reason}, after a change for the second time; {ANEW}"
         if self.refused >= MOST_REFUSED:
-            self.held = f"{HELD}: {MOST_REFUSED} passes in a row were not learned from, the last as {reason}"
+            why = f"{MOST_REFUSED} passes in a row were not learned from, the last as {reason}"
+            self.held = f"{HELD}: {why}; {ANEW}"
 
     def limited_by(self, drift: float) -> str:
         """Return what keeps the error where it is: noise, bandwidth, learn_limit, voltage range, drift, or learning."""

@@ -31,6 +31,8 @@ SCATTER_SHARE = 0.3
 # Share that is left after another pass of a gain's variance by what was not foretold, and where nothing has tested it;
 # share of what the changes of one harmonic alone say of its gain.
 FORGOTTEN, KEPT, OWN_KEPT = 0.4, 0.9, 0.9
+# Standard deviations by which what is read of the path itself is not explained, until its gain is not known.
+RIDDLE = 8.0
 # Most of that variance, as a multiple of that of the first guess.
 MOST_MISFIT = 4.0
 # A share of the noise's new estimate in each pass, of one harmonic and (by this number of harmonics) of the floor.
@@ -158,11 +160,24 @@ class Harmonics:
         """Whether the phase of a gain is known to 45 degrees, with 1.7 standard deviations."""
         return np.asarray(np.sqrt(self.gain_variance) <= PHASE_KNOWN * np.abs(self.gain))
 
-    def begun(self, correction: ComplexArray, reading: ComplexArray, answer: Answer) -> "Harmonics":
-        """Return what is known after the first two passes; arguments as of `after`."""
-        return replace(
-            self._at(correction, reading, self.noise + answer.transient_variance, answer), noise=self.noise, passes=1
-        )
+    def begun(
+        self, correction: ComplexArray, reading: ComplexArray, answer: Answer, path: ComplexArray, rest: FloatArray
+    ) -> "Harmonics":
+        """Return what is known after the first two passes.
+
+        Arguments as of `after`; of the path with its correction, `path` is (K,), metres, and `rest` the variance (m^2)
+        that is left of its hysteresis. Where even that and the gain do not explain what was read, a mode that nobody
+        knows of rings, and the gain is not known.
+        """
+        noise, squares = self.noise + answer.transient_variance, around(np.abs(path) ** 2)
+        apart = around(np.abs(reading - answer.gain * path) ** 2)
+        apart = apart - RIDDLE**2 * (rest + noise + answer.variance * squares)
+        power = np.abs(answer.gain) ** 2
+        told = np.maximum(apart, 0.0) / np.maximum(squares + rest / np.maximum(power, LEAST_GAIN**2), 1e-300)
+        misfit = np.minimum(told, MOST_MISFIT * self.guessed)
+        gain, variance = self._joint(answer, misfit)
+        answer = replace(answer, gain=gain, variance=variance)
+        return replace(self._at(correction, reading, noise, answer), noise=self.noise, misfit=misfit, passes=1)
 
     def at(self, correction: ComplexArray, reading: ComplexArray) -> "Harmonics":
         """Return the same with what was read, (K,), metres, in an earlier pass with a correction (m)."""

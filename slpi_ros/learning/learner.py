@@ -70,18 +70,19 @@ class Learner:
         if not dt > 0.0 or float(np.abs(np.diff(self.t) - dt).max()) > UNEVEN * dt:
             raise UsageError("the times of a pass are not evenly spaced; interpolate the path at even times")
         most = dict(learn_limit) if isinstance(learn_limit, Mapping) else dict.fromkeys(model.axes, learn_limit)
-        for each in most.values():
-            if each is not None and not 0.0 < each < np.inf:
-                raise UsageError(f"learn_limit is {each}; give a positive number of metres")
+        for name, each in most.items():
+            model.axis(name)
+            if each is not None and not (isinstance(each, (int, float, np.number)) and 0.0 < each < np.inf):
+                raise UsageError(f"learn_limit is {each!r}; give a positive number of metres")
         self._default = axis or (next(iter(model.axes)) if len(model.axes) == 1 else "")
         self.axes: dict[str, AxisLearner] = {}
         for name, path in self._by_axis(desired, "desired").items():
             if not np.isfinite(path).all():
                 raise UsageError(f"axis '{name}': the desired path holds values that are not finite; leave them out")
             one = model.axis(name)
-            low, high = one.voltage_range
-            allowed = (low, high) if limits is None else (max(low, limits[0]), min(high, limits[1]))
-            self.axes[name] = AxisLearner(one, dt, path, most.get(name), allowed)
+            self.axes[name] = AxisLearner(one, dt, path, most.get(name), _allowed(name, one.voltage_range, limits))
+        if not self.axes:
+            raise UsageError("desired holds no axis; give the path of one at least")
 
     def path(self) -> Any:
         """Return what to compensate in the next pass, metres, in the form of `desired`; at first the desired path."""
@@ -153,6 +154,10 @@ class Learner:
         if the document is not valid, or of another stage or path; then nothing of it is taken over.
         """
         validate(document, "learned", source)
+        try:
+            json.dumps(document, allow_nan=False)
+        except ValueError:
+            raise ModelError(f"{source}: a number in it is not finite; learn the path anew") from None
         if document["hardware_id"] != self.model.hardware_id:
             raise ModelError(
                 f"{source}: learned on stage '{document['hardware_id']}', the model is of '{self.model.hardware_id}'; "
@@ -214,6 +219,24 @@ class Learner:
 
     def _in_form(self, by_axis: dict[str, Any]) -> Any:
         return by_axis if self._named else next(iter(by_axis.values()))
+
+
+def _allowed(name: str, own: tuple[float, float], limits: Any) -> tuple[float, float]:
+    """Return the voltage limits (V) within the identified range of an axis."""
+    if limits is None:
+        return own
+    try:
+        low, high = (float(each) for each in limits)
+    except (TypeError, ValueError):
+        raise UsageError(f"limits are {limits!r}; give two voltages, the lower one first") from None
+    sound = low < high
+    low, high = max(own[0], low), min(own[1], high)
+    if not (sound and low < high):
+        raise UsageError(
+            f"axis '{name}': limits {limits!r} leave nothing of the identified range {own[0]:g} to {own[1]:g} V; give "
+            "two voltages, the lower one first"
+        )
+    return low, high
 
 
 def path_identity(t: FloatArray, desired: Mapping[str, FloatArray]) -> str:

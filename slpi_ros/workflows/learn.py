@@ -27,7 +27,7 @@ class LearnRequest:
 
     `desired`: times (s) and displacements (m) of one pass by axis; default: that of `learned`, else what the first pass
     was asked for. `period` (s): the passes follow each other without a pause; default: each trajectory is a pass.
-    `learned`: document of what was learned before.
+    `learned`: document of what was learned before, from the file `learned_file`.
     """
 
     source: Source
@@ -36,6 +36,7 @@ class LearnRequest:
     period: float | None = None
     learned: Mapping[str, Any] | None = None
     learn_limit: float | None = None
+    learned_file: str = "what was learned"
 
 
 @dataclass(frozen=True)
@@ -150,7 +151,7 @@ def _learner(request: LearnRequest, record: Record, begun: _Begun, axes: Sequenc
     else:
         raise UsageError(f"{record.source}: holds no desired displacements; give the path by --desired")
     learner = Learner(request.model, t, desired, learn_limit=request.learn_limit)
-    remarks = learner.resume(request.learned) if request.learned is not None else []
+    remarks = learner.resume(request.learned, request.learned_file) if request.learned is not None else []
     return learner, remarks
 
 

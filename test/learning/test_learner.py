@@ -13,7 +13,7 @@ from scipy.signal import cont2discrete, lfilter
 import slpi_ros
 from slpi_ros.effects.filters import Mode
 from slpi_ros.effects.resonance import Resonance
-from slpi_ros.errors import ModelError, UsageError
+from slpi_ros.errors import ModelError, SlpiError, UsageError
 from slpi_ros.learning.axis_learner import GAIN, MOST_REFUSED
 from slpi_ros.learning.first_guess import MOST_DOUBT, first_guess
 from slpi_ros.learning.harmonics import PHASE_KNOWN, TEST_SHARE, Answer, Harmonics
@@ -432,7 +432,7 @@ def answer(gain, variance):
 def test_what_a_change_brings_with_it_is_learned():
     n = 40
     none, known = np.zeros(n, complex), answer(np.ones(n), np.full(n, 0.05**2))
-    begun = Harmonics.first(known.gain, known.variance, np.full(n, 1e-20)).begun(none, none, known)
+    begun = Harmonics.first(known.gain, known.variance, np.full(n, 1e-20)).begun(none, none, known, none, np.zeros(n))
     again = begun.after(none, none, known)
     assert not again.scatter.any()
     change = np.full(n, 1e-7 + 0j)
@@ -450,7 +450,9 @@ def test_a_repeating_error_that_walks_is_followed_and_noise_is_not():
 
     def far(walk):
         """Return the rms of expected - true, in standard deviations of the noise, in the last of 40 passes."""
-        filtered = Harmonics.first(known.gain, known.variance, np.full(n, 2.0 * sigma**2)).begun(none, none, known)
+        filtered = Harmonics.first(known.gain, known.variance, np.full(n, 2.0 * sigma**2)).begun(
+            none, none, known, none, np.zeros(n)
+        )
         apart = []
         for number in range(40):
             true = np.full(n, walk * sigma * number, complex)
@@ -502,6 +504,58 @@ def test_a_damaged_file_is_refused_and_changes_nothing(model, place, change):
     with pytest.raises(ModelError):
         learner.resume(document)
     assert np.array_equal(learner.path(), before)
+
+
+@pytest.mark.parametrize("place", [("gain",), ("worst_m2",), ("offset_m",), ("learn_limit_m",)])
+def test_a_number_that_is_not_finite_is_refused(model, place):
+    document = learned(model, 3)[0].to_document()
+    _change(document["axes"]["x"], place, lambda _: float("nan"))
+    with pytest.raises(ModelError, match="finite"):
+        slpi_ros.Learner(model, *path()).resume(document)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"learn_limit": "a"}, {"learn_limit": {"q": 1e-6}}, {"learn_limit": -1.0}, {"limits": 5}, {"limits": (0,)},
+        {"limits": (100.0, 0.0)}, {"limits": (float("nan"), 1.0)}, {"limits": (500.0, 600.0)},
+    ],
+)  # fmt: skip
+def test_options_that_make_no_sense_are_refused(model, options):
+    with pytest.raises(SlpiError):
+        slpi_ros.Learner(model, *path(), **options)
+
+
+def test_a_change_that_makes_an_unknown_mode_ring_is_made_smaller(model):
+    """A sharp turn makes a light mode ring that no model told of: no pass is much worse, and it is learned."""
+    n = 800
+    t = np.arange(n) / RATE
+    levels = np.repeat([0.0, 2e-6, 4e-6, 2e-6], n // 4)
+    window = np.hanning(7)
+    desired = 8e-6 + np.convolve(np.pad(levels, (3, 3), "wrap"), window / window.sum(), "valid")
+    learner, stage = slpi_ros.Learner(model, t, desired), Stage(desired[0], frequency=280.0, damping=0.01)
+    errors = []
+    for _ in range(20):
+        true, read = stage.run(learner.path())
+        errors.append(float(np.std(true - desired)))
+        learner.update(read)
+    assert max(errors) < 3.0 * max(errors[:2])
+    assert errors[-1] < 0.2 * errors[1]
+
+
+def test_a_new_path_whose_readings_are_no_answer_is_to_blame(model):
+    learner, stage, _ = learned(model, 6)
+    axis, gains = learner.axes["x"], []
+    axis.harmonics = replace(axis.harmonics, noise=1e-6 * axis.harmonics.noise)
+    while len(gains) < 2 and len(learner.passes["x"]) < 40:
+        changed = not np.array_equal(learner.path() - axis.desired, axis._last)
+        read = stage.run(learner.path())[1]
+        report = learner.update(2 * axis.desired.mean() - read if changed else read)
+        if changed:
+            assert not report.learned
+            gains.append(axis.gain)
+    assert gains == [0.5 * GAIN, 0.25 * GAIN]
+    assert axis.held
 
 
 def test_nothing_is_taken_over_where_one_axis_is_damaged(model):
@@ -572,7 +626,7 @@ def test_no_step_without_a_phase_but_a_test_of_limited_answer():
     gain, noise = np.ones(n, complex), np.full(n, 1e-20)
     variance = np.array([0.0, 0.1, 0.2, 0.4, 1.0, 4.0]) ** 2
     none = np.zeros(n, complex)
-    known = Harmonics.first(gain, variance, noise).begun(none, none, answer(gain, variance))
+    known = Harmonics.first(gain, variance, noise).begun(none, none, answer(gain, variance), none, np.zeros(n))
     desired = np.full(n, 1e-6 + 0j)
     step = known.step(np.zeros(n, complex), desired, 1.0)
     assert step[0] == 0.0

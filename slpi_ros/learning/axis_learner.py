@@ -374,11 +374,16 @@ class AxisLearner:
     def _return(self, why: str, rms: float) -> None:
         """Go back to the best pass with half the gain; the second time without a better one since, hold."""
         assert self.best is not None
-        self.correction, self.gain, self.returns = self.best.correction, 0.5 * self.gain, self.returns + 1
+        self.correction = self.best.correction
         self._returned, self._settling, self._worst = 1, rms**2, max(self._worst, rms**2)
         # What was learned of the last pass is not to make a riddle of the next one.
         self.harmonics = self.harmonics.at(self.spectrum.of(self.best.correction), self.spectrum.of(self.best.reading))
         self._told = f"{why}; back to the best, at half the gain"
+        self._blame_change(why)
+
+    def _blame_change(self, why: str) -> None:
+        """Halve the gain; the second time without a better pass since, hold."""
+        self.gain, self.returns = 0.5 * self.gain, self.returns + 1
         if self.returns >= MOST_RETURNS:
             self.held = f"{HELD}: {why}, for the second time; {ANEW}"
 
@@ -393,9 +398,7 @@ class AxisLearner:
         if self.best is not None and (new or self.refused >= MOST_REFUSED):
             self.correction, self._returned, self._settling = self.best.correction, 1, math.inf
             if answered:
-                self.gain, self.returns = 0.5 * self.gain, self.returns + 1
-                if self.returns >= MOST_RETURNS:
-                    self.held = f"{HELD}: {reason}, after a change for the second time; {ANEW}"
+                self._blame_change(f"{reason}, after a change")
         if self.refused >= MOST_REFUSED:
             why = f"{MOST_REFUSED} passes in a row were not learned from, the last as {reason}"
             self.held = f"{HELD}: {why}; {ANEW}"

@@ -111,8 +111,8 @@ def test_a_mode_that_rings_from_pass_to_pass_is_waited_for(model, hertz):
         errors.append(float(np.std(true - desired)))
         learner.update(read)
 
-    # The mode falls by the factor e within 71 ms.
-    assert unchanged == {15.0: 3, 20.0: 3, 40.0: 3}[hertz]
+    # The mode falls by the factor e within 71 ms, more than a pass.
+    assert unchanged == 3
     assert errors[-1] < 0.3 * errors[1]
     # The first passes follow the desired path itself, while the mode begins to ring.
     assert max(errors[unchanged:]) < 1.1 * max(errors[:unchanged])

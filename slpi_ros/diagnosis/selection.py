@@ -219,13 +219,23 @@ def _ended(
 ) -> tuple[Explanation, tuple[Named, ...]]:
     """Return the fit with the effects at their best parameters together, and what it names."""
     # There, some may no longer be necessary.
-    now = _without_needless(_plainer(now.refined(CONVERGED), rivals), set(rivals), restart=False)
-    return now, _named(start, now, rivals)
+    now = now.refined(CONVERGED)
+    plain, own = _simplified(now, rivals)
+    ended = _without_needless(_plainer(plain, own), set(own), restart=False)
+    if plain is not now and len(ended.effects) < len(now.effects):
+        # What a simpler effect leaves may hide another one, which counts beside the given one.
+        exact = {name: list(others) for name, others in rivals.items()}
+        other = _without_needless(_plainer(now, exact), set(exact), restart=False)
+        if len(other.effects) > len(ended.effects) and counts(ended.held_out, other.held_out, own=False):
+            ended, own = other, exact
+    rivals.clear()
+    rivals.update(own)
+    return ended, _named(start, ended, rivals)
 
 
-def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
-    """Return the fit with simpler effects, unless clearly worse, without those at bounds, implausible or uncertain."""
-    several, step, refused = len(now.evidence.parts) > 1, usual_step(now.t), set[str]()
+def _simplified(now: Explanation, rivals: Mapping[str, list[Effect]]) -> tuple[Explanation, dict[str, list[Effect]]]:
+    """Return the fit with simpler effects in place of those that are not clearly better, and the rivals of these."""
+    own, step = {name: list(others) for name, others in rivals.items()}, usual_step(now.t)
     for effect in now.effects:
         simple = effect.simpler(step)
         if simple is None or simple.name in {other.name for other in now.effects}:
@@ -233,9 +243,15 @@ def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
         other = now.replacing(effect.name, simple).refined(CONVERGED)
         # A lag also rounds off turns that the hysteresis model makes too sharp.
         if not clearly_better(now.held_out, other.held_out, now.noise):
-            rest = [rival for rival in rivals.pop(effect.name, []) if rival.name != simple.name]
-            rivals[simple.name] = [effect, *rest]
+            rest = [rival for rival in own.pop(effect.name, []) if rival.name != simple.name]
+            own[simple.name] = [effect, *rest]
             now = other
+    return now, own
+
+
+def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
+    """Return the fit without effects at bounds, implausible or uncertain ones, or with their rivals."""
+    several, refused = len(now.evidence.parts) > 1, set[str]()
     for effect in now.effects:
         name = effect.name
         if several and effect.at_bound:

@@ -21,7 +21,7 @@ SURROGATES, TAIL = 1999, 0.05
 TINY, LEAST_CHANCE = 1e-30, 1e-12
 # Largest accepted ratio of the error with an effect to that without it, on any held-out record; and largest rise of its
 # mean square there, as a share of the fall of the mean square of all: what is left may be divided otherwise.
-NO_WORSE, RISE = 1.05, 0.05
+NO_WORSE, RISE = 1.05, 0.4
 
 
 def chance_of_gain(before: Score, after: Score, trials: float = 1.0) -> float:

@@ -192,6 +192,8 @@ class StreamingResonance(StreamingBase):
 # Modes of the candidates: lowest frequency (Hz), highest as share of the sampling rate, number of spectral peaks.
 LOWEST, HIGHEST, LINES = 10.0, 0.45, 4
 DAMPINGS = (0.02, 0.08)
+# Step of the derivatives by frequency, as a share of the half bandwidth, and by damping, as a share of that.
+STEP = 0.05
 # Largest damping ratio of a resonance; above it a mode hardly rings, and is a lag.
 MOST_DAMPING = 0.3
 # Highest frequency of any resonance, as a multiple of the highest excited frequency; above it only sharp ones can be
@@ -307,13 +309,24 @@ class Resonance(EffectBase):
     @classmethod
     def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
         """Yield single modes at the strongest frequencies of the residual, and on a logarithmic grid."""
+
+        def column(mode: Mode) -> FloatArray:
+            return cls((mode,)).apply(context.h, context.around) - context.h
+
         highest = HIGHEST / usual_step(context.t)
         found = [frequency for frequency in rhythms(context, LINES, LOWEST) if frequency < highest]
         for frequency in (*found, *np.geomspace(min(2 * LOWEST, highest), highest, 10).tolist()):
             for damping in DAMPINGS:
                 mode = Mode(frequency, damping)
-                column = cls((mode,)).apply(context.h, context.around) - context.h
-                yield Candidate(column[:, None], partial(cls._if_seen, mode), positive=1)
+                columns = [column(mode)]
+                if frequency in found and damping == DAMPINGS[0]:
+                    # A mode that rings for long explains nothing beside its frequency: both are free to first order.
+                    near = (
+                        replace(mode, frequency=frequency * (1.0 + STEP * damping)),
+                        replace(mode, damping=damping * (1.0 + STEP)),
+                    )
+                    columns = [*(column(one) - columns[0] for one in near), *columns]
+                yield Candidate(np.column_stack(columns), partial(cls._if_seen, mode), positive=1)
 
     @classmethod
     def _if_seen(cls, mode: Mode, gains: FloatArray) -> "Resonance | None":

@@ -11,7 +11,7 @@ import numpy as np
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import ModelError, length
 from slpi_ros.learning.dynamics import Dynamics, Measured, Pass
-from slpi_ros.learning.first_guess import first_guess, known_modes, ringing
+from slpi_ros.learning.first_guess import amplification, first_guess, known_modes, ringing
 from slpi_ros.learning.harmonics import ComplexArray, Harmonics
 from slpi_ros.learning.passes import Judged, agreed, held_back, judge
 from slpi_ros.learning.spectrum import PathSpectrum
@@ -127,7 +127,8 @@ class AxisLearner:
         self._history: list[Pass] = []
         self._undisturbed: Pass | None = None  # the second pass, from which on the path is changed
         noise = np.full(self.frequency.size, self.spectrum.size * max(axis.quality.floor_rms, 1e-12) ** 2)
-        self.harmonics = Harmonics.first(*first_guess(axis, dt, self.frequency), noise)
+        amplified = amplification(axis, self.frequency)
+        self.harmonics = Harmonics.first(*first_guess(axis, dt, self.frequency), noise, amplified)
         self.dynamics = Dynamics(
             self.spectrum.size, dt, self.spectrum.closed,
             lambda frequency: first_guess(axis, dt, frequency), known_modes(axis, dt),

@@ -26,8 +26,8 @@ RESIDUE = 2.0
 POLE, DECAY, ITERATIONS = 5e-3, 0.4, 3
 # Standard deviations by which a frequency may move: two modes that become one explain everything.
 REACH = 2.0
-# Frequencies beside a mode, relative, for which the first guess counts, too.
-BESIDE = (-0.1, -0.05, 0.05, 0.1)
+# Frequencies at a mode and beside it, relative, for which the first guess counts, too.
+BESIDE = (-0.1, -0.05, -0.01, 0.0, 0.01, 0.05, 0.1)
 # A mode is looked for in the first passes, in the last rows of the estimate, as long as there are fewer. It counts if
 # it takes this share of what is left, weighted, and so much of it (chi squared). Share of rounding errors.
 SEARCH_PASSES, SEARCHED, MOST_MODES, EXPLAINED, CLEARLY, RIDGE = 8, 5, 3, 0.15, 15.0, 1e-6

@@ -71,6 +71,16 @@ def ringing(axis: AxisModel) -> list[tuple[float, float]]:
     return [(mode.frequency, 1.0 / (2.0 * math.pi * mode.frequency * mode.damping)) for mode in modes]
 
 
+def amplification(axis: AxisModel, frequency: FloatArray) -> FloatArray:
+    """Return how much identified modes amplify what is left of the hysteresis, (K,), at least 1; `frequency` (Hz)."""
+    found: ComplexArray = np.ones(frequency.size, dtype=np.complex128)
+    for effect in axis.stage_only.effects:
+        for mode in getattr(effect, "modes", ()):
+            ratio = frequency / mode.frequency
+            found += mode.gain * (1.0 / (1.0 - ratio**2 + 2j * mode.damping * ratio) - 1.0)
+    return np.maximum(np.abs(found), 1.0)
+
+
 def known_modes(axis: AxisModel, dt: float) -> list[Mode]:
     """Return the modes that ring behind the inverse, sampled at `dt` (s): identified ones, and those of the inverse."""
     found: list[Mode] = []

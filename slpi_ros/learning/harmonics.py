@@ -95,6 +95,8 @@ class Harmonics:
         their estimate.
     guessed : ndarray
         Variance of the first guess of the gain.
+    amplified : ndarray
+        Factor by which identified modes amplify what is left of the hysteresis.
     passes : int
         Number of passes that the estimates come from.
 
@@ -121,11 +123,12 @@ class Harmonics:
     changed: FloatArray
     answers: ComplexArray
     guessed: FloatArray
+    amplified: FloatArray
     passes: int = 0
 
     @classmethod
-    def first(cls, gain: ComplexArray, variance: FloatArray, noise: FloatArray) -> "Harmonics":
-        """Return what is known before the first pass: the first guess of the gains, and the sensor's noise."""
+    def first(cls, gain: ComplexArray, variance: FloatArray, noise: FloatArray, amplified: FloatArray) -> "Harmonics":
+        """Return what is known before the first pass: the first guess of the gains, the sensor's noise, and modes."""
         none = np.zeros_like(gain)
         return cls(
             gain,
@@ -143,6 +146,7 @@ class Harmonics:
             np.zeros_like(noise),
             none,
             variance,
+            amplified,
         )
 
     def expected(self, correction: ComplexArray) -> ComplexArray:
@@ -200,13 +204,14 @@ class Harmonics:
         """Return the variance (m^2, (K,)) of what is left of the hysteresis of a path, (K,), metres, in the reading.
 
         It is a share of the path's own harmonics nearby, and of lower ones where it falls with the square of the
-        frequency, as turns make it. It passes through the mechanics, as the path itself does.
+        frequency, as turns make it. It passes through the mechanics as the path itself does, but not through the
+        inverse, which takes out of the path what would make a mode ring.
         """
         squared = np.arange(1.0, path.size) ** 2
         turning = np.append(0.0, np.maximum.accumulate(np.abs(path[1:]) * squared) / squared)
         share = REST_SHARE**2 * around(np.abs(path) ** 2) + TURN_SHARE**2 * turning**2
         squares: FloatArray = np.abs(self.gain) ** 2
-        return np.asarray(share * (squares + np.minimum(squares, self.gain_variance)))
+        return np.asarray(share * self.amplified**2 * (squares + np.minimum(squares, self.gain_variance)))
 
     def after(self, correction: ComplexArray, reading: ComplexArray, answer: Answer) -> "Harmonics":
         """Return what is known after another pass.

@@ -11,11 +11,12 @@ from identification.records import calibration
 from scipy.signal import cont2discrete, lfilter
 
 import slpi_ros
+from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.filters import Mode
 from slpi_ros.effects.resonance import Resonance
 from slpi_ros.errors import ModelError, SlpiError, UsageError
 from slpi_ros.learning.axis_learner import GAIN, MOST_REFUSED
-from slpi_ros.learning.first_guess import MOST_DOUBT, first_guess
+from slpi_ros.learning.first_guess import MOST_DOUBT, amplification, first_guess
 from slpi_ros.learning.harmonics import PHASE_KNOWN, TEST_SHARE, Answer, Harmonics
 from slpi_ros.learning.passes import judge
 
@@ -398,6 +399,39 @@ def test_the_first_guess_is_the_linear_answer_whatever_the_hysteresis(model):
     assert np.sqrt(doubt[5]) == pytest.approx(MOST_DOUBT)
 
 
+def test_an_identified_mode_amplifies_what_is_left_of_the_hysteresis(model):
+    axis, n = ringing_model(model).axes["x"], 4000
+    (resonance,), t = axis.effects, np.arange(20 * n) / 4000.0
+    frequency = np.array([0.0, 5.0, 100.0, 222.0, 223.0, 230.0, 900.0])
+    amplified = amplification(axis, frequency)
+    for hertz, factor in zip(frequency[1:], amplified[1:], strict=True):
+        y = resonance.apply(np.sin(2 * np.pi * hertz * t), EffectContext(t))[-n:]
+        assert factor == pytest.approx(max(np.abs(np.fft.rfft(y)).max() / (n / 2), 1.0), rel=0.02)
+    assert amplified[0] == 1.0 and amplified[4] == pytest.approx(0.94 / (2 * 0.01), rel=0.02)
+    assert np.array_equal(amplification(model.axes["x"], frequency), np.ones(7))
+    none, squares = np.zeros(7, complex), np.full(7, 1e-20)
+    plain, ringing = (Harmonics.first(none + 1.0, squares, squares, one) for one in (np.ones(7), amplified))
+    turns = 1e-6 / np.arange(1.0, 8.0) ** 2 + 0j
+    assert ringing.of_hysteresis(turns) == pytest.approx(amplified**2 * plain.of_hysteresis(turns))
+
+
+def test_what_hysteresis_makes_of_an_identified_mode_is_no_answer_to_the_path(model):
+    # The 11th harmonic is at the mode, which the inverse takes out: nearly all that rings comes from the hysteresis.
+    mode = Resonance(modes=(Mode(frequency=440.0, damping=0.0145, gain=1.0),))
+    told = slpi_ros.StageModel({"x": replace(model.axes["x"], effects=(mode,))})
+    t, desired = path(40.0)
+    learner = slpi_ros.Learner(told, t, desired)
+    stage = Stage(desired[0], frequency=443.0, damping=0.014, inverted=(440.0, 0.0145))
+    errors = []
+    for _ in range(20):
+        true, read = stage.run(learner.path())
+        errors.append(float(np.std(true - desired)))
+        learner.update(read)
+    assert errors[-1] < NOISE
+    assert not learner.axes["x"].held
+    assert max(errors[3:]) < 1.1 * max(errors[:3])
+
+
 def test_a_mode_that_begins_to_ring_is_no_lie(model):
     told = ringing_model(model)
     t, desired = path(20.0)
@@ -432,7 +466,9 @@ def answer(gain, variance):
 def test_what_a_change_brings_with_it_is_learned():
     n = 40
     none, known = np.zeros(n, complex), answer(np.ones(n), np.full(n, 0.05**2))
-    begun = Harmonics.first(known.gain, known.variance, np.full(n, 1e-20)).begun(none, none, known, none, np.zeros(n))
+    begun = Harmonics.first(known.gain, known.variance, np.full(n, 1e-20), np.ones(n)).begun(
+        none, none, known, none, np.zeros(n)
+    )
     again = begun.after(none, none, known)
     assert not again.scatter.any()
     change = np.full(n, 1e-7 + 0j)
@@ -450,7 +486,7 @@ def test_a_repeating_error_that_walks_is_followed_and_noise_is_not():
 
     def far(walk):
         """Return the rms of expected - true, in standard deviations of the noise, in the last of 40 passes."""
-        filtered = Harmonics.first(known.gain, known.variance, np.full(n, 2.0 * sigma**2)).begun(
+        filtered = Harmonics.first(known.gain, known.variance, np.full(n, 2.0 * sigma**2), np.ones(n)).begun(
             none, none, known, none, np.zeros(n)
         )
         apart = []
@@ -626,7 +662,9 @@ def test_no_step_without_a_phase_but_a_test_of_limited_answer():
     gain, noise = np.ones(n, complex), np.full(n, 1e-20)
     variance = np.array([0.0, 0.1, 0.2, 0.4, 1.0, 4.0]) ** 2
     none = np.zeros(n, complex)
-    known = Harmonics.first(gain, variance, noise).begun(none, none, answer(gain, variance), none, np.zeros(n))
+    known = Harmonics.first(gain, variance, noise, np.ones(n)).begun(
+        none, none, answer(gain, variance), none, np.zeros(n)
+    )
     desired = np.full(n, 1e-6 + 0j)
     step = known.step(np.zeros(n, complex), desired, 1.0)
     assert step[0] == 0.0

@@ -72,11 +72,18 @@ def test_a_gain_that_chance_gives_does_not_count():
     assert gain(before, after) > LEAST_GAIN and not counts(before, after)
 
 
-@pytest.mark.parametrize(("rise", "expected"), [(0.38, True), (0.42, False)])
-def test_one_record_may_rise_by_two_fifths_of_what_all_fall_by(rise, expected):
+@pytest.mark.parametrize(("rise", "expected"), [(0.04, True), (0.06, False)])
+def test_one_record_may_rise_by_a_twentieth_of_what_all_fall_by(rise, expected):
     before = np.array([1.0, 1.0, 400.0])
     fall = 360.0 / 3.0
     assert worse_on_none(before, np.array([1.0, 1.0 + rise * fall, 400.0 - 360.0 - rise * fall])) is expected
+
+
+@pytest.mark.parametrize(("rise", "expected"), [(0.38, True), (0.42, False)])
+def test_one_record_that_is_left_out_may_rise_by_two_fifths_of_what_all_fall_by(rise, expected):
+    before, fall = np.array([1.0, 1.0, 400.0]), 100.0
+    after = np.array([1.0, 1.0 + rise * fall, 400.0 - 3.0 * fall - rise * fall])
+    assert carries_over(score(1e-8, 1e-18 * before), score(1e-9, 1e-18 * after)) is expected
 
 
 @pytest.mark.parametrize(("other", "expected"), [(1.01e-9, True), (9e-9, False)])

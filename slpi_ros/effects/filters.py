@@ -6,7 +6,7 @@ from math import cos, exp, expm1, pi, sin, sqrt
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.parameters import Fit, parameter
@@ -87,6 +87,11 @@ class Mode:
     def lag(self) -> float:
         """Steady-state delay of the response to a ramp, seconds."""
         return 2 * self.damping / self.omega
+
+    def response(self, frequency: FloatArray) -> NDArray[np.complex128]:
+        """Return the frequency response, shape (K,), at frequencies (Hz, (K,))."""
+        ratio = frequency / self.frequency
+        return np.asarray(1.0 / (1.0 - ratio**2 + 2j * self.damping * ratio))
 
     def release(self, t: FloatArray) -> FloatArray:
         """Return the position, shape (N,), at times `t` (s) after a release from 1 at rest, with input 0."""

@@ -76,8 +76,7 @@ def amplification(axis: AxisModel, frequency: FloatArray) -> FloatArray:
     found: ComplexArray = np.ones(frequency.size, dtype=np.complex128)
     for effect in axis.stage_only.effects:
         for mode in getattr(effect, "modes", ()):
-            ratio = frequency / mode.frequency
-            found += mode.gain * (1.0 / (1.0 - ratio**2 + 2j * mode.damping * ratio) - 1.0)
+            found += mode.gain * (mode.response(frequency) - 1.0)
     return np.maximum(np.abs(found), 1.0)
 
 

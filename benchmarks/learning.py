@@ -26,7 +26,7 @@ import math
 import sys
 import time
 import warnings
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -57,6 +57,9 @@ RECORDS = ((CALIBRATION, 4.0), (CALIBRATION, 0.6), ("resonance", 2.0))
 # integral (1/s).
 FIXED = [(gain, band) for gain in (0.3, 0.6, 1.0) for band in (40.0, 100.0, 250.0)]
 PI = [(p, i) for p in (0.0, 0.2) for i in (20.0, 80.0, 250.0)]
+METHODS = ("PI", "line", "inverse")
+# Passes with feedback, and the most samples of them.
+FEEDBACK_PASSES, MOST_SAMPLES = 5, 30_000
 PATHS = ("raster 1", "raster 5", "raster 20", "raster 40", "raster f/10", "sine", "steps", "free")
 # Of steps: levels, as shares of half the path; rise (s), time constants of the mode until they count, and how long they
 # count then (s).
@@ -290,9 +293,9 @@ def without_dynamics(run: Run, judged: FloatArray, gain: float, band: float, pas
 
 
 def compare(
-    specimen: Specimen, axis: slpi_ros.AxisModel, name: str, passes: int, beside: bool
+    specimen: Specimen, axis: slpi_ros.AxisModel, name: str, passes: int, beside: Collection[str]
 ) -> dict[str, list[float]]:
-    """Return the true error (nm) of every pass with each method."""
+    """Return the true error (nm) of every pass with the learner, with the inverse alone, and with others `beside`."""
     desired = path_of(name, specimen, axis)
     judged, t = judged_of(name, specimen, desired), np.arange(desired.size) / RATE_HZ
     run, learner = Run(specimen, axis, desired), slpi_ros.Learner(slpi_ros.StageModel({"x": axis}), t, desired)
@@ -310,21 +313,19 @@ def compare(
     for _ in range(passes):
         errors["alone"].append(rms(run.follow(desired)[1], desired, judged))
         run.back()
-    if not beside:
-        return errors
-    for method in ("line", "inverse"):
+    for method in {"line", "inverse"}.intersection(beside):
         tried = [
             without_dynamics(Run(specimen, axis, desired, straight=method == "line"), judged, gain, band, passes)
             for gain, band in FIXED
         ]
         errors[method] = min(tried, key=lambda found: found[-1])
-    tried = []
-    for proportional, integral in PI:
-        run = Run(specimen, axis, desired)
-        if desired.size * 5 > 30_000:
-            break
-        tried.append([rms(run.feedback(proportional, integral), desired, judged) for _ in range(5)])
-    errors["PI"] = min(tried, key=lambda found: found[-1]) if tried else [math.nan]
+    # Sample by sample, which takes too long for longer paths.
+    if "PI" in beside and desired.size * FEEDBACK_PASSES <= MOST_SAMPLES:
+        tried = []
+        for gains in PI:
+            run = Run(specimen, axis, desired)
+            tried.append([rms(run.feedback(*gains), desired, judged) for _ in range(FEEDBACK_PASSES)])
+        errors["PI"] = min(tried, key=lambda found: found[-1])
     return errors
 
 
@@ -350,7 +351,7 @@ def main() -> int:
     parser.add_argument("--passes", type=int, default=20)
     parser.add_argument("--paths", nargs="+", choices=PATHS, default=["raster 5", "raster 20", "raster f/10", "free"])
     parser.add_argument("--all-paths", action="store_true", help="every path")
-    parser.add_argument("--alone", action="store_true", help="the learner alone")
+    parser.add_argument("--beside", nargs="*", choices=METHODS, default=METHODS, help="what else to run; default: all")
     parser.add_argument("--models", type=Path, help="folder in which identified models are kept")
     parser.add_argument("-v", action="store_true", help="tell what happened in which pass")
     parser.add_argument("--keep", action="store_true", help=f"write the row of the first raster 20 to {kept.KEPT.name}")
@@ -370,14 +371,14 @@ def main() -> int:
               f"lag {1e3 * specimen.lag:.2f} ms; found: {causes}"
               f"  ({time.perf_counter() - began:.0f} s)", flush=True)  # fmt: skip
         for name in PATHS if options.all_paths else options.paths:
-            errors = compare(specimen, axis, name, options.passes, not options.alone)
+            errors = compare(specimen, axis, name, options.passes, options.beside)
             own, noise, fifth = errors["learner"], 1e9 * specimen.noise, min(5, options.passes - 1)
             marks = []
             if own[-1] > noise:
                 marks.append("NOISE")
             if own[-1] > max(0.1 * own[0], noise):
                 marks.append("TENTH")
-            if not options.alone and own[fifth] > max(errors["line"][fifth] / 3.0, noise):
+            if "line" in errors and own[fifth] > max(errors["line"][fifth] / 3.0, noise):
                 marks.append("LINE")
             if max(own) > 1.1 * max(own[0], noise):
                 marks.append("HARM")

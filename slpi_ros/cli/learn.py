@@ -3,7 +3,6 @@
 import math
 from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
-from dataclasses import asdict
 from pathlib import Path
 
 from slpi_ros.cli import options as common
@@ -49,10 +48,10 @@ def _run(options: Namespace) -> Result:
     from slpi_ros.workflows.learn import LearnRequest, learn
 
     inputs = [options.model, *options.bags, *([options.desired] if options.desired else [])]
-    common.require_another_file(options.output, *inputs, *([options.learned] if options.learned else []))
     if options.learned:
         common.require_another_file(options.learned, *inputs)
         options.remarks += allow_document(options.learned, "learned", overwrite=options.overwrite)
+    common.require_another_file(options.output, *inputs, *([options.learned] if options.learned else []))
     if options.report:
         common.allow_folder(options, options.report, FILE, inputs=inputs)
     if options.learn_limit is not None and not 0.0 < options.learn_limit < math.inf:
@@ -83,7 +82,7 @@ def _run(options: Namespace) -> Result:
         ]
     document = {
         "next": options.output,
-        "axes": {name: {"passes": [asdict(one) for one in axis.passes]} for name, axis in learner.axes.items()},
+        "axes": {name: {"passes": [one.to_document() for one in axis.passes]} for name, axis in learner.axes.items()},
     }
     return Result(
         lines, document, command_line("slpi", "compensate", options.model, options.output, "-o", "VOLTAGE.csv")

@@ -243,8 +243,9 @@ def require_another_file(output: str, *inputs: str) -> None:
     """Raise UsageError if the output file is one of the inputs, or lies in the folder of an input bag."""
     for path in map(Path, inputs):
         # Of a link that leads to itself, `Path.resolve` makes an error of its own.
-        within = path.is_dir() and Path(os.path.realpath(path)) in Path(os.path.realpath(output)).parents
-        if within or (path.exists() and Path(output).exists() and path.samefile(output)):
+        real, written = Path(os.path.realpath(path)), Path(os.path.realpath(output))
+        same = path.samefile(output) if path.exists() and Path(output).exists() else real == written
+        if same or (path.is_dir() and real in written.parents):
             raise UsageError(f"{output}: is also read from; give another output (-o)")
 
 

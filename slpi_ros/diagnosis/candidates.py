@@ -14,11 +14,11 @@ from slpi_ros.diagnosis.prepare import drive_frequency, excited_frequency
 from slpi_ros.diagnosis.significance import (
     ALIKE,
     LEAST_GAIN,
-    NO_WORSE,
     chance_of_gain,
     clearly_better,
     counts,
     independent_trials,
+    worse_left_out,
 )
 from slpi_ros.effects.base import Candidate, Effect, FitContext, is_course
 from slpi_ros.effects.registry import EFFECTS
@@ -261,7 +261,7 @@ def alike(best: Contender, other: Contender, before: Score, *, one_speed: bool) 
     one, two = EFFECTS[best.name], EFFECTS[other.name]
     if one.time_shift == "only" and two.contains_shift:
         return False
-    if best.score.records.size and other.score.rms_of_records > NO_WORSE * best.score.rms_of_records:
+    if worse_left_out(best.score, other.score):
         return False
     if one_speed and one.dynamic and two.dynamic:
         return by_other >= ALTERNATIVE_AT_ONE_SPEED * explained

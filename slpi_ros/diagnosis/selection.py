@@ -20,7 +20,15 @@ from slpi_ros.diagnosis.candidates import (
 )
 from slpi_ros.diagnosis.joint_fit import FINEST, Explanation, Score
 from slpi_ros.diagnosis.prepare import one_speed
-from slpi_ros.diagnosis.significance import ALIKE, LEAST_GAIN, chance_of_gain, clearly_better, counts, gain
+from slpi_ros.diagnosis.significance import (
+    ALIKE,
+    LEAST_GAIN,
+    chance_of_gain,
+    clearly_better,
+    counts,
+    gain,
+    worse_left_out,
+)
 from slpi_ros.diagnosis.structures import BIAS, STRUCTURES
 from slpi_ros.effects.base import Effect, usual_step
 from slpi_ros.effects.registry import EFFECTS
@@ -220,33 +228,26 @@ def _ended(
     """Return the fit with the effects at their best parameters together, and what it names."""
     # There, some may no longer be necessary.
     now = now.refined(CONVERGED)
-    plain, own = _simplified(now, rivals)
-    ended = _without_needless(_plainer(plain, own), set(own), restart=False)
-    if plain is not now and len(ended.effects) < len(now.effects):
-        # What a simpler effect leaves may hide another one, which counts beside the given one.
-        exact = {name: list(others) for name, others in rivals.items()}
-        other = _without_needless(_plainer(now, exact), set(exact), restart=False)
-        if len(other.effects) > len(ended.effects) and counts(ended.held_out, other.held_out, own=False):
-            ended, own = other, exact
-    rivals.clear()
-    rivals.update(own)
-    return ended, _named(start, ended, rivals)
+    now = _simplified(now, rivals)
+    now = _without_needless(_plainer(now, rivals), set(rivals), restart=False)
+    return now, _named(start, now, rivals)
 
 
-def _simplified(now: Explanation, rivals: Mapping[str, list[Effect]]) -> tuple[Explanation, dict[str, list[Effect]]]:
-    """Return the fit with simpler effects in place of those that are not clearly better, and the rivals of these."""
-    own, step = {name: list(others) for name, others in rivals.items()}, usual_step(now.t)
+def _simplified(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:
+    """Return the fit with simpler effects in place of those that are not clearly better, which become their rivals."""
+    step = usual_step(now.t)
     for effect in now.effects:
         simple = effect.simpler(step)
         if simple is None or simple.name in {other.name for other in now.effects}:
             continue
         other = now.replacing(effect.name, simple).refined(CONVERGED)
         # A lag also rounds off turns that the hysteresis model makes too sharp.
-        if not clearly_better(now.held_out, other.held_out, now.noise):
-            rest = [rival for rival in own.pop(effect.name, []) if rival.name != simple.name]
-            own[simple.name] = [effect, *rest]
+        better = clearly_better(now.held_out, other.held_out, now.noise) or worse_left_out(now.held_out, other.held_out)
+        if not better:
+            rest = [rival for rival in rivals.pop(effect.name, []) if rival.name != simple.name]
+            rivals[simple.name] = [effect, *rest]
             now = other
-    return now, own
+    return now
 
 
 def _plainer(now: Explanation, rivals: dict[str, list[Effect]]) -> Explanation:

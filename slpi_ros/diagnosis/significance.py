@@ -97,14 +97,27 @@ def worse_on_none(before: FloatArray, after: FloatArray, rise: float = RISE) -> 
 
 def counts(before: Score, after: Score, *, own: bool = True, least: float = LEAST_GAIN, trials: float = 1.0) -> bool:
     """Return whether a gain is at least `least`, significant and, unless the effect is of one record, carries over."""
-    if gain(before, after) >= LARGE_GAIN:
+    found = gain(before, after)
+    # An effect of which one record alone shows much acts in few of all blocks, too.
+    if found >= LARGE_GAIN or (not own and found >= least and _most_on_one_record(before, after) >= LARGE_GAIN):
         significant = chance_of_gain(before, after) <= CHANCE_OF_LARGE_GAIN
     else:
-        significant = gain(before, after) >= least and chance_of_gain(before, after, trials) <= CHANCE
+        significant = found >= least and chance_of_gain(before, after, trials) <= CHANCE
     return significant and (own or carries_over(before, after))
+
+
+def _most_on_one_record(before: Score, after: Score) -> float:
+    """Return the largest relative reduction of the error on a held-out record; 0 for one record."""
+    both = np.isfinite(before.records) & np.isfinite(after.records) & (before.records > 0.0)
+    return 1.0 - float(np.sqrt(np.min(after.records[both] / before.records[both], initial=1.0)))
 
 
 def clearly_better(best: Score, other: Score, noise: float) -> bool:
     """Return whether an explanation is better than another one by more than it leaves itself beyond the `noise` (m)."""
     # What is left beyond the noise is a defect of the model, and a difference within it may be its doing.
     return other.rms**2 - best.rms**2 > max(best.rms**2 - noise**2, 0.0)
+
+
+def worse_left_out(best: Score, other: Score) -> bool:
+    """Return whether an explanation is worse than another one on records that are left out; False for one record."""
+    return bool(best.records.size) and other.rms_of_records > NO_WORSE * best.rms_of_records

@@ -3,7 +3,7 @@
 import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -69,7 +69,8 @@ class PassReport:
     `error` is what repeats and can be learned: rms of measured - desired without the mean and the drift of the pass,
     which are `offset` (m) and `drift` (m over the pass); `absolute` is the rms with both. `bumps`: samples left out.
     `reason`: why the pass was not learned from, or what it led to; "" if it was learned from. `limited_by`: what keeps
-    the error where it is. `bandwidth` (Hz): below it the phase of every harmonic is known.
+    the error where it is. `bandwidth` (Hz): below it the phase of every harmonic is known. Errors are NaN without a
+    reading.
     """
 
     number: int
@@ -82,6 +83,16 @@ class PassReport:
     reason: str
     limited_by: str
     bandwidth: float
+
+    @classmethod
+    def of(cls, document: Mapping[str, Any]) -> "PassReport":
+        """Return the report of a document."""
+        known = {one.name: document[one.name] for one in fields(cls)}
+        return cls(**known | {name: math.nan for name in ("error", "absolute") if known[name] is None})
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the report as a part of a document; null for errors without a reading."""
+        return {name: None if value != value else value for name, value in asdict(self).items()}
 
 
 @dataclass(frozen=True)
@@ -147,6 +158,10 @@ class AxisLearner:
         """The desired path of the passes after the next one, (N,), metres."""
         return self._within_range(self.correction)
 
+    def is_followed_by(self, asked: FloatArray) -> bool:
+        """Return whether what was asked of the compensator in a pass (m, (N,)) is the path with a correction."""
+        return bool(np.abs(asked - self.desired).max() <= self.limit + SAME_PATH)
+
     def _within_range(self, correction: FloatArray) -> FloatArray:
         low, high = self.axis.displacement_range
         low, high = min(low, float(self.desired.min())), max(high, float(self.desired.max()))
@@ -169,7 +184,10 @@ class AxisLearner:
         `unusable`: why it is not to be learned from, if that is known.
         """
         if followed is not None and not np.allclose(followed, self.path, rtol=0.0, atol=SAME_PATH):
-            self.correction = self._before = followed - self.desired
+            if self.is_followed_by(followed):
+                self.correction = self._before = followed - self.desired
+            else:
+                unusable = unusable or "what was asked of the compensator is another path"
         commanded = self.path - self.desired
         self._before = self.correction
         seen = (
@@ -195,7 +213,7 @@ class AxisLearner:
         clean = judged.measured - offset - drift * (np.arange(measured.size) / measured.size - 0.5)
         rest = (clean - self.desired)[np.isfinite(clean)]
         whole = (seen - self.desired)[np.isfinite(seen)]
-        rms, absolute = (float(np.sqrt(np.mean(x**2))) if x.size else 0.0 for x in (rest, whole))
+        rms, absolute = (float(np.sqrt(np.mean(x**2))) if x.size else math.nan for x in (rest, whole))
         self._remember(commanded, None if reason else clean)
         if reason:
             self._refuse(reason, new=bool((commanded != self._last).any()), answered=not known)
@@ -458,6 +476,8 @@ class AxisLearner:
 
     def _replayed(self, measured: FloatArray, commanded: FloatArray) -> str:
         """Return that a pass is the copy of an earlier one, although another path was commanded; "" if not."""
+        if not np.isfinite(measured).any():
+            return ""
         known = hashlib.sha256(np.ascontiguousarray(measured).tobytes()).hexdigest()
         path = hashlib.sha256(commanded.tobytes()).hexdigest()
         earlier = [each.split(":")[1] for each in self._hashes if each.startswith(known)]
@@ -519,7 +539,7 @@ class AxisLearner:
                 "answers": _pairs(h.answers),
                 "passes": h.passes,
             },
-            "passes": [asdict(one) for one in self.passes],
+            "passes": [one.to_document() for one in self.passes],
         }
 
     def _check_sizes(self, document: Mapping[str, Any]) -> None:
@@ -537,7 +557,10 @@ class AxisLearner:
                 _check_size(name, values, size)
 
     def resume(self, document: Mapping[str, Any], *, same_model: bool) -> None:
-        """Go on from a document of the same path; of another model, only the correction of the path is taken over."""
+        """Go on from a document of the same path; of another model, only the correction of the path is taken over.
+
+        ModelError if parts of the document are of another size or do not belong together.
+        """
         _check_size("correction_m", document["correction_m"], self.desired.size)
         if same_model:
             self._check_sizes(document)
@@ -558,14 +581,14 @@ class AxisLearner:
         self.gain, self.held = document["gain"], document["held"]
         self.returns, self.refused, self._offset = document["returns"], document["refused"], document["offset_m"]
         if document["deviating"] is not None:
-            self._deviating = np.zeros(self.desired.size, dtype=np.bool_)
-            self._deviating[np.array(document["deviating"], dtype=np.intp)] = True
+            deviating = np.array(document["deviating"], dtype=np.intp)
+            self._deviating = np.isin(np.arange(self.desired.size), deviating)
         if best := document["best"]:
             self.best = _Best(
                 best["number"], best["power_m2"], np.array(best["correction_m"]), np.array(best["reading_m"])
             )
         self._hashes = list(document["hashes"])
-        self.passes = [PassReport(**one) for one in document["passes"]]
+        self.passes = [PassReport.of(one) for one in document["passes"]]
         self.harmonics = replace(
             h,
             gain=_complex(numbers["gain"]),
@@ -584,6 +607,11 @@ class AxisLearner:
             answers=_complex(numbers["answers"]),
             passes=numbers["passes"],
         )
+        with np.errstate(all="ignore"):
+            expected, spread = self._expected(self.path - self.desired)
+            whole = float(np.sum(expected)) + self._scatter() + (spread if self.harmonics.passes else 0.0)
+        if not math.isfinite(whole) or (self.best and self.best.number > self.passes[-1].number):
+            raise ModelError("its numbers do not belong together; learn the path anew")
 
 
 def _check_size(name: str, values: Any, size: int) -> None:

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
+from slpi_ros.errors import ModelError
 from slpi_ros.learning.harmonics import Answer, ComplexArray
 from slpi_ros.learning.least_squares import Row, normal, solved, variance_of
 from slpi_ros.learning.modes import Mode, ModeAnswers, candidates
@@ -186,7 +187,8 @@ class Dynamics:
         }
 
     def resume(self, document: Mapping[str, Any]) -> None:
-        """Go on from a document of the same path and model."""
+        """Go on from a document of the same path and model; ModelError if its parts are of different sizes."""
+        self._check_sizes(document)
         self.restart([Mode(**one) for one in document["begun"]])
         self.modes = tuple(Mode(**one) for one in document["modes"])
         self._residues, self._rings = (
@@ -199,6 +201,19 @@ class Dynamics:
         )
         if document["parameters"] is not None:
             self._parameters = np.array(document["parameters"])
+
+    def _check_sizes(self, document: Mapping[str, Any]) -> None:
+        count = len(document["modes"])
+        size = self._taps + 2 * count
+        shapes = {"begun": (count,), "residues": (2, count), "ringing_m": (2, count), "parameters": (size,)}
+        wrong = [name for name, shape in shapes.items() if np.shape(document[name]) not in ((), shape)]
+        for name in ("oldest", "carried"):
+            if (pair := document[name]) is not None:
+                matrix, vector = (np.shape(part) for part in pair)
+                wrong += [name] if len(vector) != 1 or vector[0] > size or matrix != 2 * vector else []
+        wrong += ["kicks_m"] if any(mode >= count for _, mode, *_ in document["kicks_m"]) else []
+        if wrong:
+            raise ModelError(f"{wrong[0]} does not fit to {count} modes; learn the path anew")
 
     def _estimate(self, given: Measured, *, search: bool) -> Answer:
         passes, undisturbed, of_change = given.passes, given.undisturbed, given.of_change

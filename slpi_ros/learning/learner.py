@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.errors import ModelError, UsageError
+from slpi_ros.errors import ModelError, UsageError, length
 from slpi_ros.io.atomic_file import all_or_nothing
 from slpi_ros.io.input_limits import MODEL_BYTES, read_input
 from slpi_ros.io.schemas import format_document, validate
@@ -48,7 +48,7 @@ class Learner:
     Raises
     ------
     UsageError
-        If an axis, a length or a value does not fit.
+        If an axis, a length or a value does not fit, or the path is far from the range of the model.
     """
 
     def __init__(
@@ -72,7 +72,8 @@ class Learner:
         most = dict(learn_limit) if isinstance(learn_limit, Mapping) else dict.fromkeys(model.axes, learn_limit)
         for name, each in most.items():
             model.axis(name)
-            if each is not None and not (isinstance(each, (int, float, np.number)) and 0.0 < each < np.inf):
+            number = isinstance(each, (int, float, np.number)) and not isinstance(each, bool)
+            if each is not None and not (number and 0.0 < each < np.inf):
                 raise UsageError(f"learn_limit is {each!r}; give a positive number of metres")
         self._default = axis or (next(iter(model.axes)) if len(model.axes) == 1 else "")
         self.axes: dict[str, AxisLearner] = {}
@@ -80,6 +81,12 @@ class Learner:
             if not np.isfinite(path).all():
                 raise UsageError(f"axis '{name}': the desired path holds values that are not finite; leave them out")
             one = model.axis(name)
+            (low, high), reached = one.displacement_range, (float(path.min()), float(path.max()))
+            if max(low - reached[0], reached[1] - high) > high - low:
+                raise UsageError(
+                    f"axis '{name}': the desired path goes from {length(reached[0])} to {length(reached[1])}, the "
+                    f"model from {length(low)} to {length(high)}; give a path within that, in metres"
+                )
             self.axes[name] = AxisLearner(one, dt, path, most.get(name), _allowed(name, one.voltage_range, limits))
         if not self.axes:
             raise UsageError("desired holds no axis; give the path of one at least")
@@ -103,10 +110,11 @@ class Learner:
         measured : as `desired`, metres
             Readings of the sensors at the times of the pass; NaN where there is none.
         voltage : as `desired`, optional, volts
-            Voltage in the pass, if it is known: a pass that a limit held back is not learned from.
+            Voltage in the pass, NaN where it is not known: a pass that a limit held back is not learned from.
         followed : as `desired`, optional, metres
             What was asked of the compensator in the pass; default: the last `path`. A pass that had begun before `path`
-            was known, or that was repeated by hand, followed an earlier one.
+            was known, or that was repeated by hand, followed an earlier one. A pass of another path, more than
+            `learn_limit` from this one, is not learned from.
         unusable : mapping of axis name to str, optional
             Why the pass is not to be learned from, if that is known: a limit held the voltage back.
 
@@ -120,6 +128,9 @@ class Learner:
         if missing := self.axes.keys() - seen.keys():
             raise UsageError(f"no readings of axis '{min(missing)}'; give those of every axis of the path")
         asked = {} if followed is None else self._by_axis(followed, "followed")
+        for name, path in asked.items():
+            if not np.isfinite(path).all():
+                raise UsageError(f"axis '{name}': followed holds values that are not finite; leave the pass out")
         why = unusable or {}
         return self._in_form(
             {
@@ -173,9 +184,11 @@ class Learner:
             same = learned["model"] == self._identity(name) and "before_m" in learned
             try:
                 axis.resume(learned, same_model=same)
-            except (ModelError, IndexError, KeyError, TypeError, ValueError) as error:
-                what = f"it has no {error}; learn the path anew" if isinstance(error, KeyError) else error
-                raise ModelError(f"{source}: axis '{name}': {what}") from None
+            except ModelError as error:
+                raise ModelError(f"{source}: axis '{name}': {error}") from None
+            except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+                what = f"it has no {error}" if isinstance(error, KeyError) else "its numbers do not belong together"
+                raise ModelError(f"{source}: axis '{name}': {what}; learn the path anew") from None
             if not same:
                 why = "a file of an earlier version" if learned["model"] == self._identity(name) else "another model"
                 remarks.append(f"axis '{name}': {why}; learned anew, from the correction of the path so far")
@@ -207,6 +220,8 @@ class Learner:
         for name, values in signal.items():
             self.model.axis(name)
             try:
+                if np.iscomplexobj(values):
+                    raise TypeError("it is complex")
                 found[name] = np.array(values, dtype=np.float64)
             except (TypeError, ValueError) as error:
                 raise UsageError(f"axis '{name}': {what} is not an array of numbers: {error}") from None

@@ -230,8 +230,12 @@ class RepeatedPaths:
                 learner.update(done.measured, voltage, followed=done.followed, unusable=done.unusable)
             except SlpiError as error:
                 told.append(f"not learned: {error}")
+            except (ArithmeticError, LookupError, TypeError, ValueError) as error:
+                # Of a file whose numbers do not belong together; the other paths are to be learned on.
+                told.append(f"learned afresh: what was learned cannot be gone on with: {error!r}")
                 continue
-            self._learners[path.identity] = learner
+            if learner is not None:
+                self._learners[path.identity] = learner
         for old in [*self._learners][:-MOST_PATHS]:
             del self._learners[old]
         return [

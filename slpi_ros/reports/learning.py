@@ -1,5 +1,6 @@
 """The page of a path that repeats: error over passes, over the path, its spectrum, and what is left."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -40,7 +41,7 @@ def write_files(folder: Path, outcome: LearnOutcome) -> None:
         page.verdict(name, describe(name, axis), "warn" if held else "good", "held" if held else "")
         page.tiles({
             "first pass": length(axis.passes[0].error),
-            "best pass": length(min(one.error for one in axis.passes)),
+            "best pass": length(min((one.error for one in axis.passes if one.learned), default=math.nan)),
             "last pass": length(last.error),
             "absolute, last pass": length(last.absolute),
             "noise of a reading": length(axis.noise),

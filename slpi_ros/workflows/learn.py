@@ -12,8 +12,8 @@ from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.desired import DesiredPath, at_times, read_desired
 from slpi_ros.io.record import Record
-from slpi_ros.learning.axis_learner import PassReport
-from slpi_ros.learning.learner import Learner
+from slpi_ros.learning.axis_learner import MOST_REFUSED, PassReport
+from slpi_ros.learning.learner import FEWEST, Learner
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.workflows.records import Source, mismatch_in_data, shared_axes
 
@@ -67,7 +67,7 @@ class _Begun:
 
 
 def learn(request: LearnRequest) -> LearnOutcome:
-    """Learn from the passes of all bags, in order of time; RecordError if there is no complete pass."""
+    """Learn from the passes of all bags, in order of time; RecordError if there is no complete pass, or none of use."""
     source, model = request.source, request.model
     if request.period is not None and not 0.0 < request.period < math.inf:
         raise UsageError(f"period is {request.period} s; give a positive number of seconds")
@@ -82,15 +82,27 @@ def learn(request: LearnRequest) -> LearnOutcome:
     found: list[LearnedPass] = []
     remarks: list[str] = []
     for bag, record in read:
+        others = 0
         asked = [one for one in (read_desired(bag, record.axes) if bag else []) if one.axis in axes]
         for begun in _passes(request, record, asked, axes):
             if learner is None:
                 learner, told = _learner(request, record, begun, axes)
                 remarks += told
-            found += _taken(learner, record, begun)
+            taken = _taken(learner, record, begun)
+            found += taken or []
+            others += taken is None
+        if others:
+            remarks.append(f"{record.source}: {others} passes were asked for another path, and are left out")
     if learner is None or not found:
         what = "--period, and --desired" if request.period is None else "a shorter --period, or another bag"
-        raise RecordError(f"{read[0][1].source}: holds no complete pass of the path; give {what}")
+        known = f"; {remarks[-1]}" if remarks else ""
+        raise RecordError(f"{read[0][1].source}: holds no complete pass of the path; give {what}{known}")
+    if len(found) >= MOST_REFUSED and not any(report.learned for one in found for report in one.reports.values()):
+        reason = next(iter(found[-1].reports.values())).reason
+        raise RecordError(
+            f"{read[0][1].source}: none of {len(found)} passes is of use, the last as {reason}; give bags of this "
+            "path, by --desired and --period if no desired displacements were recorded"
+        )
     return LearnOutcome(learner, found, remarks)
 
 
@@ -106,6 +118,13 @@ def _passes(
         each = [(start_ns, list(paths)) for start_ns, paths in groups]
         return [_Begun(ns, paths) for ns, paths in each if {one.axis for one in paths} >= set(axes)]
     period = request.period or _duration(request)
+    # Its last reading stands for a whole interval, too: a bag of exactly one pass holds one.
+    interval_ns = float(np.median(np.diff(record.time_ns))) if len(record) > 1 else 0.0
+    if period is not None and period < FEWEST * interval_ns * 1e-9:
+        raise UsageError(
+            f"{record.source}: a pass of {period:g} s has less than {FEWEST} readings, {interval_ns * 1e-9:g} s apart; "
+            "give the --period of a whole pass"
+        )
     if period is None:
         raise UsageError(
             f"{record.source}: holds no trajectory, so that nothing tells where a pass begins; give --period, and "
@@ -113,10 +132,8 @@ def _passes(
         )
     begin_ns = max([first_ns, *(int(one.time_ns[0]) for one in asked)])
     if source.start is not None:
-        begin_ns = first_ns + round(1e9 * source.start)
+        begin_ns = first_ns + round(1e9 * max(source.start, 0.0))
     end_ns = last_ns if source.stop is None else first_ns + round(1e9 * source.stop)
-    # Its last reading stands for a whole interval, too: a bag of exactly one pass holds one.
-    interval_ns = float(np.median(np.diff(record.time_ns))) if len(record) > 1 else 0.0
     count = max(0, int((end_ns - begin_ns + interval_ns) * 1e-9 / period + 1e-6))
     return [_Begun(begin_ns + round(1e9 * k * period), asked or None) for k in range(count)]
 
@@ -151,6 +168,9 @@ def _learner(request: LearnRequest, record: Record, begun: _Begun, axes: Sequenc
     else:
         raise UsageError(f"{record.source}: holds no desired displacements; give the path by --desired")
     learner = Learner(request.model, t, desired, learn_limit=request.learn_limit)
+    lasts = _lasts(learner)
+    if request.period is not None and request.period < lasts * (1.0 - 0.5 / learner.t.size):
+        raise UsageError(f"--period {request.period:g} s is shorter than the path, which lasts {lasts:g} s")
     remarks = learner.resume(request.learned, request.learned_file) if request.learned is not None else []
     return learner, remarks
 
@@ -161,10 +181,15 @@ def _asked_at(begun: _Begun, t: FloatArray, axes: Sequence[str]) -> dict[str, Fl
     return {axis: sampled[axis] for axis in axes if axis in sampled}
 
 
-def _taken(learner: Learner, record: Record, begun: _Begun) -> list[LearnedPass]:
-    """Let the learner have one pass, if the record holds it whole; return it."""
-    t = learner.t - learner.t[0]
-    duration = float(t[-1] * t.size / (t.size - 1))
+def _lasts(learner: Learner) -> float:
+    """Return the duration (s) of a pass, with the interval of its last sample."""
+    t = learner.t
+    return float((t[-1] - t[0]) * t.size / (t.size - 1))
+
+
+def _taken(learner: Learner, record: Record, begun: _Begun) -> list[LearnedPass] | None:
+    """Let the learner have one pass, if the record holds it whole; return it, and None if it is of another path."""
+    t, duration = learner.t - learner.t[0], _lasts(learner)
     begin = (begun.start_ns - int(record.time_ns[0])) * 1e-9
     if begin < -1e-6 or begin + float(t[-1]) > (int(record.time_ns[-1]) - int(record.time_ns[0])) * 1e-9 + 1e-6:
         return []
@@ -175,6 +200,8 @@ def _taken(learner: Learner, record: Record, begun: _Begun) -> list[LearnedPass]
         followed = _asked_at(begun, t, tuple(learner.axes))
         if followed.keys() != learner.axes.keys() or not all(np.isfinite(y).all() for y in followed.values()):
             return []
+        if not all(one.is_followed_by(followed[axis]) for axis, one in learner.axes.items()):
+            return None
     reports = learner.update(measured, voltage, followed=followed)
     errors = {axis: measured[axis] - one.desired for axis, one in learner.axes.items()}
     return [LearnedPass(record.source, begin, errors, reports)]

@@ -17,6 +17,7 @@ from slpi_ros.diagnosis.significance import (
     counts,
     gain,
     independent_trials,
+    worse_left_out,
     worse_on_none,
 )
 
@@ -84,6 +85,25 @@ def test_one_record_that_is_left_out_may_rise_by_two_fifths_of_what_all_fall_by(
     before, fall = np.array([1.0, 1.0, 400.0]), 100.0
     after = np.array([1.0, 1.0 + rise * fall, 400.0 - 3.0 * fall - rise * fall])
     assert carries_over(score(1e-8, 1e-18 * before), score(1e-9, 1e-18 * after)) is expected
+
+
+@pytest.mark.parametrize(("share", "expected"), [(0.28, False), (0.32, True)])
+def test_an_effect_of_which_one_record_alone_shows_much_acts_in_few_blocks(share, expected):
+    records, left = np.array([1.0, 1.0, 4.0]), np.ones(BLOCKS)
+    left[:4] = [0.2, 0.3, 0.9, 0.2]
+    before = Score(np.full(BLOCKS, 1e-16), NOTHING, 1e-16 * records)
+    after = Score(1e-16 * left, NOTHING, 1e-16 * records * np.array([1.0, 1.0, (1.0 - share) ** 2]))
+    assert gain(before, after) < 0.3 and CHANCE < chance_of_gain(before, after) < 0.05
+    assert counts(before, after, own=False) is expected
+    # Of what is separate in each record, those that are left out tell nothing.
+    assert not counts(before, after)
+
+
+@pytest.mark.parametrize(("records", "expected"), [(1.04, False), (1.06, True), (None, False)])
+def test_a_simpler_effect_may_be_worse_on_records_that_are_left_out_by_a_twentieth(records, expected):
+    best = score(1e-9, np.full(2, 1e-16) if records else NOTHING)
+    other = score(1e-9, np.full(2, 1e-16 * records**2) if records else NOTHING)
+    assert worse_left_out(best, other) is expected
 
 
 @pytest.mark.parametrize(("other", "expected"), [(1.01e-9, True), (9e-9, False)])

@@ -545,6 +545,66 @@ def test_options_that_make_no_sense_are_refused(model, options):
         slpi_ros.Learner(model, *path(), **options)
 
 
+@pytest.mark.parametrize(
+    ("place", "change"),
+    [
+        (("harmonics", "noise_m2"), lambda x: [0.0] * len(x)), (("harmonics", "noise_m2"), lambda x: [1e300] * len(x)),
+        (("deviating",), lambda _: [10**30]), (("hashes",), lambda x: [x[0].split(":")[0]]),
+        (("dynamics", "kicks_m"), lambda _: [[-50, 0.5, 1.0, 1.0]]),
+        (("dynamics", "kicks_m"), lambda _: [[1, 10**9, 1.0, 1.0]]),
+        (("dynamics", "residues"), lambda x: [[*x[0], 1.0], [*x[1], 1.0]]),
+        (("dynamics", "parameters"), lambda _: [1.0]), (("dynamics", "carried"), lambda _: [[[1.0]], [1.0, 2.0]]),
+        (("dynamics", "oldest"), lambda _: [1.0]), (("best", "number"), lambda _: 10**18), (("passes",), lambda _: []),
+    ],
+)  # fmt: skip
+def test_numbers_of_a_file_that_do_not_belong_together_are_refused(model, place, change):
+    document = learned(model, 4)[0].to_document()
+    assert document["axes"]["x"]["best"] and document["axes"]["x"]["hashes"]
+    _change(document["axes"]["x"], place, change)
+    learner = slpi_ros.Learner(model, *path())
+    with pytest.raises(ModelError):
+        learner.resume(document)
+    assert not learner.passes["x"]
+
+
+@settings(max_examples=10, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(1e-9, 2e-6), st.floats(2.0, 50.0))
+def test_what_followed_another_path_is_not_learned_from(model, seed, limit, beyond):
+    t, desired = path()
+    rng = np.random.default_rng(seed)
+    other = desired + beyond * limit * np.sin(2 * np.pi * rng.uniform(1, 9) * t / t[-1] + rng.uniform(0.0, 6.0))
+    other[desired.size // 3] = desired[desired.size // 3] + beyond * limit
+    learner = slpi_ros.Learner(model, t, desired, learn_limit=limit)
+    report = learner.update(other + rng.normal(0.0, NOISE, t.size), followed=other)
+    assert not report.learned
+    assert np.array_equal(learner.path(), desired)
+
+
+def test_what_was_followed_is_known_and_the_path_is_one_of_the_stage(model):
+    t, desired = path()
+    learner = slpi_ros.Learner(model, t, desired)
+    for wrong in (np.full(t.size, np.nan), desired.astype(complex)):
+        with pytest.raises(UsageError):
+            learner.update(desired, followed=wrong)
+    for wrong in (1e6 * desired, 1e3 * desired, desired - 1.0, desired.astype(complex)):
+        with pytest.raises(UsageError):
+            slpi_ros.Learner(model, t, wrong)
+    with pytest.raises(UsageError):
+        slpi_ros.Learner(model, t, desired, learn_limit=True)
+
+
+def test_a_pass_without_a_reading_has_no_error(model):
+    learner, stage, _ = learned(model, 4)
+    for _ in range(2):
+        report = learner.update(np.full(stage.run(learner.path())[1].size, np.nan))
+        assert not report.learned and np.isnan([report.error, report.absolute]).all()
+        assert "replayed" not in report.reason
+    document = learner.to_document()
+    assert document["axes"]["x"]["passes"][-1]["error"] is None
+    again = slpi_ros.Learner(model, *path())
+    assert again.resume(document) == [] and np.isnan(again.passes["x"][-1].error)
+
+
 def test_a_change_that_makes_an_unknown_mode_ring_is_made_smaller(model):
     """A sharp turn makes a light mode ring that no model told of: no pass is much worse, and it is learned."""
     n = 800

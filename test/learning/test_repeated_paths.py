@@ -105,6 +105,16 @@ def test_several_passes_of_one_correction_make_one_step(model):
     assert errors[-1] < NOISE < 0.1 * errors[1]
 
 
+def test_a_pass_that_cannot_be_learned_loses_nothing_that_was_learned(model):
+    way = sampled()
+    stage, paths = Stage(way.desired["x"][0]), RepeatedPaths(model)
+    learned, _ = run(paths, way, stage, 6)
+    done, _ = passed(way, learned.correction["x"], stage)
+    (after,) = paths.learn(replace(done, followed={"x": np.full(way.desired["x"].size, np.nan)}))
+    assert after.remarks and after.axes["x"].passes == 6
+    assert np.array_equal(after.correction["x"], learned.correction["x"])
+
+
 def test_limits_are_kept_and_forgetting_removes_the_files(model, tmp_path):
     prefix, way = str(tmp_path / "learned"), sampled()
     paths = RepeatedPaths(model, prefix, {"x": 20e-9})

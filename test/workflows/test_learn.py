@@ -129,3 +129,50 @@ def test_what_is_no_document_of_this_path_is_refused(model, tmp_path):
     learned.write_text("my notes")
     assert main(words) == 2
     assert learned.read_text() == "my notes"
+
+
+def test_passes_of_another_path_are_left_out(model, tmp_path, capsys):
+    t, y = desired()
+    other = 10e-6 + 1e-6 * np.sin(4 * np.pi * np.arange(SIZE) / SIZE)
+    table, nxt = tmp_path / "desired.csv", tmp_path / "next.csv"
+    write_table(table, t, {"x": y}, "m")
+    words = ["learn", "--model", str(model), "--desired", str(table), "--learn-limit", "0.1", "-o", str(nxt)]
+    bags = [bag_of(tmp_path / name, way) for name, way in (("own", y), ("other", other))]
+    assert main([*words, str(bags[1])]) == 1
+    assert not nxt.exists()
+    capsys.readouterr()
+    assert main([*words, *map(str, bags), "--json"]) == 0
+    assert len(json.loads(capsys.readouterr().out)["axes"]["x"]["passes"]) == PASSES
+    assert np.abs(read_table(nxt, "m")[1]["x"] - y).max() <= 0.1e-6 + 1e-12
+
+
+def test_a_period_that_is_none_of_the_path_is_refused(model, tmp_path):
+    t, y = desired()
+    bag, table = bag_of(tmp_path / "bag", y), tmp_path / "desired.csv"
+    write_table(table, t, {"x": y}, "m")
+    words = ["learn", str(bag), "--model", str(model), "-o", str(tmp_path / "next.csv")]
+    for period in ("1e-9", "0.01"):
+        assert main([*words, "--period", period]) == 2
+    assert main([*words, "--desired", str(table), "--period", str(0.5 * SIZE / RATE)]) == 2
+
+
+def test_a_bag_that_is_no_pass_leaves_what_was_learned_alone(model, tmp_path):
+    t, y = desired()
+    table, learned, nxt = tmp_path / "desired.csv", tmp_path / "learned.json", tmp_path / "next.csv"
+    write_table(table, t, {"x": y}, "m")
+    words = ["--model", str(model), "--learned", str(learned), "-o", str(nxt), "--period", str(SIZE / RATE)]
+    own = bag_of(tmp_path / "own", y, trajectories=False)
+    assert main(["learn", str(own), *words, "--desired", str(table)]) == 0
+    before = learned.read_bytes()
+    other = bag_of(tmp_path / "other", 20e-6 - y, trajectories=False)
+    assert main(["learn", str(other), *words]) == 1
+    assert learned.read_bytes() == before
+
+
+@pytest.mark.parametrize("learned", ["same.json", "./same.json", "folder/../same.json"])
+def test_what_was_learned_is_not_written_over_by_the_next_pass(model, learned, tmp_path, monkeypatch):
+    bag = bag_of(tmp_path / "bag", desired()[1])
+    (tmp_path / "folder").mkdir()
+    monkeypatch.chdir(tmp_path)
+    assert main(["learn", str(bag), "--model", str(model), "--learned", learned, "-o", "same.json"]) == 2
+    assert not (tmp_path / "same.json").exists()

@@ -168,8 +168,9 @@ def _learner(request: LearnRequest, record: Record, begun: _Begun, axes: Sequenc
     else:
         raise UsageError(f"{record.source}: holds no desired displacements; give the path by --desired")
     learner = Learner(request.model, t, desired, learn_limit=request.learn_limit)
-    lasts = _lasts(learner)
-    if request.period is not None and request.period < lasts * (1.0 - 0.5 / learner.t.size):
+    # A path may end with its first sample once more.
+    lasts = float(learner.t[-1] - learner.t[0])
+    if request.period is not None and request.period < (1.0 - 1e-6) * lasts:
         raise UsageError(f"--period {request.period:g} s is shorter than the path, which lasts {lasts:g} s")
     remarks = learner.resume(request.learned, request.learned_file) if request.learned is not None else []
     return learner, remarks
@@ -181,15 +182,10 @@ def _asked_at(begun: _Begun, t: FloatArray, axes: Sequence[str]) -> dict[str, Fl
     return {axis: sampled[axis] for axis in axes if axis in sampled}
 
 
-def _lasts(learner: Learner) -> float:
-    """Return the duration (s) of a pass, with the interval of its last sample."""
-    t = learner.t
-    return float((t[-1] - t[0]) * t.size / (t.size - 1))
-
-
 def _taken(learner: Learner, record: Record, begun: _Begun) -> list[LearnedPass] | None:
     """Let the learner have one pass, if the record holds it whole; return it, and None if it is of another path."""
-    t, duration = learner.t - learner.t[0], _lasts(learner)
+    t = learner.t - learner.t[0]
+    duration = float(t[-1] * t.size / (t.size - 1))
     begin = (begun.start_ns - int(record.time_ns[0])) * 1e-9
     if begin < -1e-6 or begin + float(t[-1]) > (int(record.time_ns[-1]) - int(record.time_ns[0])) * 1e-9 + 1e-6:
         return []

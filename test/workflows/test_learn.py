@@ -154,6 +154,9 @@ def test_a_period_that_is_none_of_the_path_is_refused(model, tmp_path):
     for period in ("1e-9", "0.01"):
         assert main([*words, "--period", period]) == 2
     assert main([*words, "--desired", str(table), "--period", str(0.5 * SIZE / RATE)]) == 2
+    # A path that ends with its first sample once more.
+    write_table(table, np.arange(SIZE + 1) / RATE, {"x": np.append(y, y[0])}, "m")
+    assert main([*words, "--desired", str(table), "--period", str(SIZE / RATE)]) == 0
 
 
 def test_a_bag_that_is_no_pass_leaves_what_was_learned_alone(model, tmp_path):

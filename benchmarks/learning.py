@@ -13,7 +13,8 @@ again and again:
 - ``inverse``: the same through the inverse;
 - ``learner``: `slpi_ros.Learner`.
 
-Printed is the **true** error, rms in nm, without the mean of the pass: of the first pass, and after 5 and `--passes`
+Printed is the **true** error, rms in nm, without the mean of the pass and (but for feedback, which sees it) the drift
+of the stage: of the first pass, and after 5 and `--passes`
 passes; the best gains are those with the least error after the last pass. Marks: ``NOISE`` where the last pass is
 above the sensor's noise, ``TENTH`` where it is above a tenth of the first although there was room, ``LINE`` where after
 5 passes it is above a third of ``line``, and ``HARM`` where a pass is more than a tenth worse than the first
@@ -232,7 +233,7 @@ class Run:
         self.follow(rest + (desired[0] - rest) * lead)
 
     def follow(self, path: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return voltage (V), true and measured displacement (m), (N,), for a path (m, (N,))."""
+        """Return voltage (V), true displacement without drift, and measured one (m), (N,), for a path (m, (N,))."""
         v = np.empty(path.size)
         if self._line:
             v = np.interp(path, *self._line)
@@ -241,7 +242,9 @@ class Run:
                 self._at += 1.0 / RATE_HZ
                 v[k] = self.stream.step(self._at, y)
         x = self.stage.run(v)
-        return v, x, x + self.specimen.noise * self._noise.standard_normal(x.size)
+        y = x + self.specimen.noise * self._noise.standard_normal(x.size)
+        t = self.stage.t + (1.0 + np.arange(-x.size, 0)) / RATE_HZ
+        return v, x - self.specimen.drift * t, y
 
     def back(self) -> None:
         """Lead a path that does not close back to its beginning."""

@@ -14,12 +14,11 @@ again and again:
 - ``learner``: `slpi_ros.Learner`.
 
 Printed is the **true** error, rms in nm, without the mean of the pass and (but for feedback, which sees it) the drift
-of the stage: of the first pass, and after 5 and `--passes`
-passes; the best gains are those with the least error after the last pass. Marks: ``NOISE`` where the last pass is
-above the sensor's noise, ``TENTH`` where it is above a tenth of the first although there was room, ``LINE`` where after
-5 passes it is above a third of ``line``, and ``HARM`` where a pass is more than a tenth worse than the first
-one and than the sensor's noise; ``(alone too)`` where the inverse alone is as bad in one of the same passes (the
-first one comes from rest: a mode that rings, and creep, come later).
+of the stage: of the first pass, and after 5 and `--passes` passes; the best gains are those with the least error after
+the last pass. Marks: ``NOISE`` where the last pass is above the sensor's noise, ``TENTH`` where it is above a tenth of
+the first although there was room, ``LINE`` where after 5 passes it is above a third of ``line``, and ``HARM`` where a
+pass is more than a tenth worse than the first one and than the sensor's noise; ``(alone too)`` where the inverse alone
+is as bad in one of the same passes (the first one comes from rest: a mode that rings, and creep, come later).
 """
 
 import argparse

@@ -118,17 +118,17 @@ def _passes(
         each = [(start_ns, list(paths)) for start_ns, paths in groups]
         return [_Begun(ns, paths) for ns, paths in each if {one.axis for one in paths} >= set(axes)]
     period = request.period or _duration(request)
-    # Its last reading stands for a whole interval, too: a bag of exactly one pass holds one.
-    interval_ns = float(np.median(np.diff(record.time_ns))) if len(record) > 1 else 0.0
-    if period is not None and period < FEWEST * interval_ns * 1e-9:
-        raise UsageError(
-            f"{record.source}: a pass of {period:g} s has less than {FEWEST} readings, {interval_ns * 1e-9:g} s apart; "
-            "give the --period of a whole pass"
-        )
     if period is None:
         raise UsageError(
             f"{record.source}: holds no trajectory, so that nothing tells where a pass begins; give --period, and "
             "--desired if no desired displacements were recorded"
+        )
+    # Its last reading stands for a whole interval, too: a bag of exactly one pass holds one.
+    interval_ns = float(np.median(np.diff(record.time_ns))) if len(record) > 1 else 0.0
+    if period < FEWEST * interval_ns * 1e-9:
+        raise UsageError(
+            f"{record.source}: a pass of {period:g} s has less than {FEWEST} readings, {interval_ns * 1e-9:g} s apart; "
+            "give the --period of a whole pass"
         )
     begin_ns = max([first_ns, *(int(one.time_ns[0]) for one in asked)])
     if source.start is not None:

@@ -13,10 +13,10 @@ from math import inf, nan, sin
 
 import numpy as np
 
-from slpi_ros.compensator.controller import Controller, OperatingMode
+from slpi_ros.compensator.controller import Controller, OperatingMode, StopReason
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
+from slpi_ros.compensator.motion import Safety
 from slpi_ros.compensator.persistence import SavedAxis
-from slpi_ros.compensator.ramps import Safety
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.effects.base import Effect
 from slpi_ros.effects.creep import Creep
@@ -312,7 +312,7 @@ class Episode:
                     moves = axis.output._changed_ns == self.now_ns
                     wire.begin(voltage, axis.output.rate if moves else 0.0, self.now_ns if moves else -SECOND_NS)
                     continue
-            wire.output(voltage, self.now_ns, self.ratios, self.what, axis.given_ns == self.now_ns)
+            wire.output(voltage, self.now_ns, self.ratios, self.what, self.now_ns in (axis.samples.given_ns, axis.loop.driven_ns))
         self.voltages = {name: wire.voltage for name, wire in zip(AXES, self.wires, strict=True)}
 
     def send(self, names: tuple[str, ...], shares: list[float], clock: int = 0) -> None:
@@ -386,7 +386,7 @@ class Episode:
         self.wait(self.rng.uniform(0.0, 0.2))
 
     def safety(self) -> None:
-        self.made.watch(Safety(0.05, True, True, (10.0, 60.0), 300.0), self.now_ns)
+        self.made.watch(Safety(0.05, True, True, (10.0, 60.0), 300.0), 0.0, self.now_ns)
         self.wait(0.05)
 
     def parameters(self) -> None:
@@ -422,7 +422,7 @@ class Episode:
         self.wait(self.rng.uniform(0.0, 0.1))
 
     def reactivate(self) -> None:
-        self.made.hold(self.now_ns)
+        self.made.stop(StopReason.DEACTIVATED, self.now_ns)
         while self.made.ramping and self.made.ownership.owned:
             self.wait(self.period)
         self.made.deactivate(self.now_ns)
@@ -445,13 +445,14 @@ class Episode:
         """A sensor that tells anything: zero, far away, what it said before, the wrong sign."""
         kind = self.rng.randrange(4)
         for _ in range(self.rng.randrange(1, 40)):
-            true = self.made.axes[0].stream.uncoupled_displacement if self.made.driven else 0.0
+            true = self.made.axes[0].stream.uncoupled_displacement if self.made.axes[0].model else 0.0
             told = [0.0, 1.0, 5e-6, -true][kind]
             with suppress(RejectedError):
                 self.made.measure(["x"], [told], self.now_ns, self.rng.random() < 0.8)
             self.send(AXES, [self.rng.uniform(0.3, 0.6)] * 2)
             self.wait(0.004)
-            self.made.watch_sensors(0.05, self.now_ns)
+            for axis in self.made.axes if self.made.ownership.owned else ():
+                axis.loop.faulty(0.05, self.now_ns)
 
     def intruder(self) -> None:
         """Somebody else moves the amplifier, and reports tell; then `arm`."""

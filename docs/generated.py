@@ -9,6 +9,7 @@ from importlib import import_module
 from pathlib import Path
 
 from slpi_ros import cli, nodes
+from slpi_ros.compensator.motion import MEANING, REPLACED_BY, Kind
 from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.nodes import start
 
@@ -78,6 +79,16 @@ def topics():
         ]
         sections.append(f"## {each['name']}\n\n{each['meaning']}\n\n{table(['', ''], rows)}")
     return "\n\n".join(sections)
+
+
+def motions():
+    """Return all motions of an axis, and what may replace them."""
+    every = set(Kind)
+    rows = []
+    for kind, meaning in MEANING.items():
+        others = [each.value for each in Kind if each in REPLACED_BY[kind]]
+        rows.append([code(kind.value), meaning, "any" if REPLACED_BY[kind] == every else ", ".join(map(code, others))])
+    return table(["motion", "what the axis does", "may be replaced by"], rows)
 
 
 def effects():
@@ -206,4 +217,6 @@ def example(path):
     return f"```{language}\n{(ROOT / path).read_text().strip()}\n```"
 
 
-GENERATORS = {function.__name__: function for function in (parameters, topics, effects, documents, commands, example)}
+GENERATORS = {
+    function.__name__: function for function in (parameters, topics, motions, effects, documents, commands, example)
+}

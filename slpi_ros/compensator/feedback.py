@@ -78,6 +78,7 @@ class Feedback:
         # Time of the last measurement that was used, nanoseconds.
         self._latest_ns: int | None = None
         self._desired: float | None = None
+        self._begun_ns = 0
 
     @property
     def limits(self) -> Limits:
@@ -171,15 +172,25 @@ class Feedback:
         """Store a displacement (m), and the setpoint it refers to as the sensor would tell it; default: the last."""
         self._latest = displacement, now_ns, self._desired if desired is None else desired
 
-    def step(self, dt: float, desired: float, feedforward: float, now_ns: int, timeout: float) -> float:
-        """Return the voltage (V), corrected by the last measurement unless it is used or older than `timeout` (s)."""
-        t = self._t + dt if self._t > -inf else 0.0
+    def begin(self, now_ns: int) -> None:
+        """Begin at `now_ns` (steady clock), without a correction."""
+        self._begun_ns = now_ns
+        self.hold(0.0, self.voltage)
+
+    def step(self, desired: float, feedforward: float, now_ns: int, timeout: float | None) -> float:
+        """Return the voltage (V), corrected by the last measurement unless it is used or older than `timeout` (s).
+
+        None: with the present correction, as it is not time for another one.
+        """
+        t = (now_ns - self._begun_ns) * 1e-9
+        self._desired = desired
+        if timeout is None:
+            return self.hold(t, feedforward, now_ns)
         latest, self._latest = self._latest, None
         if latest is not None:
             self._latest_ns = latest[1]
         # Between two measurements the correction is held.
         self.acting = self._latest_ns is not None and (now_ns - self._latest_ns) * 1e-9 <= timeout
-        self._desired = desired
         if latest and self.acting:
             aim = desired if latest[2] is None else latest[2]
             try:

@@ -1,15 +1,25 @@
 """Replacement of the model at run time: the memory is rebuilt from the reversals, the voltage is unchanged."""
 
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace
 from math import inf
+from statistics import median
 
+from slpi_ros.compensator.persistence import MemoryConfidence
 from slpi_ros.errors import ModelError, UsageError
 from slpi_ros.hysteresis.shapes import FAR
 from slpi_ros.hysteresis.turning_points import Memory
-from slpi_ros.model.axis_model import AxisModel, StartMemory
+from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.model.axis_model import START_MEMORIES, AxisModel, StartMemory
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.streaming import TOLERATED_SHARE, StreamingInverse
+
+# An initial state matches the first measurements if its error is at most this fraction of the identified displacement
+# range, or this multiple of the held-out error: more than overnight drift, less than the error of a wrong history.
+FIT_SHARE, FIT_SIGMAS = 0.005, 4.0
+# The median of this many measurements of at most this age decides on the initial state.
+FIRST_READINGS, FIRST_AGE_NS = 5, SECOND_NS // 5
 
 
 def take_over(
@@ -91,3 +101,49 @@ def require_near(present: float, allowed: Limits) -> None:
 def extended_to(limits: Limits, voltage: float) -> Limits:
     """Return the limits, extended to include `voltage` (V)."""
     return replace(limits, lower=min(limits.lower, voltage), upper=max(limits.upper, voltage))
+
+
+class InitialState:
+    """State of the memory at the start: `assumed` until a voltage is output, unless measurements show another one."""
+
+    def __init__(self) -> None:
+        self.assumed: StartMemory | None = None  # None once a voltage was output, or if it was restored
+        self._readings: deque[tuple[int, float]] = deque(maxlen=FIRST_READINGS)
+
+    def read(self, x: float, now_ns: int) -> None:
+        """Take a measured displacement (m)."""
+        self._readings.append((now_ns, x))
+
+    def choose(
+        self, model: AxisModel, limits: Limits, present: StreamingInverse, surroundings: dict[str, float], now_ns: int
+    ) -> tuple[StreamingInverse | None, MemoryConfidence | None]:
+        """Return the inverse with the initial state that matches the first measurements, and the confidence in it.
+
+        None: as it is. The assumed one stays unless another one matches better by more than the noise, and without
+        enough recent measurements that agree. The voltage is that of the `present` inverse.
+        """
+        recent = [x for t, x in self._readings if now_ns - t <= FIRST_AGE_NS]
+        if not self.assumed or len(recent) < FIRST_READINGS:
+            return None, None
+        measured, (low, high) = median(recent), model.displacement_range
+        noise = FIT_SIGMAS * max(model.quality.held_out_rms, model.quality.floor_rms)
+        allowed = max(noise, FIT_SHARE * (high - low))
+        if max(recent) - min(recent) > 2.0 * allowed:
+            return None, None
+        assumed, streams, errors = self.assumed, dict[StartMemory, StreamingInverse](), dict[StartMemory, float]()
+        for name in START_MEMORIES:
+            streams[name] = stream = take_over(model, limits, (), name)
+            stream.coupled = present.coupled
+            stream.surround(surroundings)
+            errors[name] = abs(measured - stream.drive(present.voltage))
+        best = min(START_MEMORIES, key=lambda name: errors[name])
+        self.assumed = None
+        self._readings.clear()
+        if errors[best] > allowed:
+            tried = ", ".join(f"{name} {error * 1e6:.4g} µm" for name, error in errors.items())
+            doubt = f"the measurement matches no initial state of the model (errors: {tried}); call ~/reset_memory"
+            return None, MemoryConfidence(doubt=doubt, contradicted=True)
+        if errors[assumed] > errors[best] + noise:
+            doubt = f"chosen by measurement: start_memory '{best}', not '{assumed}'"
+            return streams[best], MemoryConfidence(doubt=doubt)
+        return None, None

@@ -48,8 +48,7 @@ class Ownership:
             if found is None:
                 missing = missing or f"axis '{axis.name}': {self.notes[axis.name]}"
                 continue
-            axis.locate(found)
-            axis.choose_memory(now_ns)
+            axis.locate(found, now_ns)
         self.obstacle = (STARTING, missing) if missing else None
 
     def _find(self, axis: Axis, start: str | float, now_ns: int) -> tuple[float | None, str]:
@@ -118,7 +117,7 @@ class Ownership:
             assert voltage is not None
             # The last output of an axis that nobody moved is known better than a noisy report of it.
             if axis.amplifier.foreign or abs(voltage - axis.voltage) > axis.amplifier.scatter:
-                axis.locate(voltage)
+                axis.locate(voltage, now_ns)
             self._take(axis, now_ns)
         self.obstacle = None
         return ""
@@ -140,6 +139,6 @@ class Ownership:
     @staticmethod
     def _take(axis: Axis, now_ns: int) -> None:
         """Take the voltage of an axis to be that of its amplifier from now on."""
+        axis.rest(now_ns)
         axis.amplifier.begin(axis.voltage, now_ns)
-        axis.given_ns = now_ns
         axis.return_inside(now_ns)

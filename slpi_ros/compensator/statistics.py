@@ -1,6 +1,7 @@
 """Message counters, latency and tracking error of a compensator."""
 
 from array import array
+from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -25,6 +26,10 @@ class Counts:
     trajectories_rejected: int = 0
     points_held: int = 0
     points_slewing: int = 0
+    lost: int = 0  # messages, by the middleware
+    worked_off: int = 0  # messages that had waited
+    largest_backlog: int = 0
+    models_refused: int = 0
 
     @property
     def rejected(self) -> int:
@@ -35,6 +40,16 @@ class Counts:
     def measurements_rejected(self) -> int:
         """Number of rejected measured displacements."""
         return sum(self.measured_by_cause.values())
+
+    def note(self, aheads: Sequence[float | None], jump: float, held: bool, slewing: bool) -> None:
+        """Count an accepted message, `aheads` (s) after the last one of each axis by its stamp."""
+        self.accepted += 1
+        self.held_at_limit += held
+        self.slew_limited += slewing
+        known = [each for each in aheads if each is not None]
+        if known:
+            self.gaps += max(known) > jump
+            self.time_jumps += min(known) < 0.0
 
     def copy(self) -> "Counts":
         """Return a copy of the present counts."""

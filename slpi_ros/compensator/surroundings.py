@@ -1,8 +1,11 @@
 """Quantities that the stage follows, as they come in use: which values are taken, and what is wrong with the others."""
 
+from collections.abc import Mapping, Sequence
 from math import isfinite, nan
 
+from slpi_ros.compensator.axis import Axis
 from slpi_ros.effects.base import Followed
+from slpi_ros.model.stage_model import StageModel
 
 # A value beyond the recorded range by more than this share of it is not used: the model knows nothing there, and a
 # broken sensor must not move the stage.
@@ -62,3 +65,32 @@ class Surrounding:
         if age > max(OLD * self._interval_ns, LEAST_NS):
             return f"{key} is {age * 1e-9:.3g} s old: the last one, {self.value:.5g}, stays in use; check its publisher"
         return ""
+
+
+class Surroundings(dict[str, Surrounding]):
+    """The quantities that the model in use follows, by name, and the axes that follow them."""
+
+    def __init__(self, axes: Sequence[Axis]) -> None:
+        super().__init__()
+        self._axes = axes
+
+    def use(self, model: StageModel) -> None:
+        """Follow the quantities of a model; what is known of those that the last one followed as well stays."""
+        known = dict(self)
+        self.clear()
+        for followed in (each for axis in model.axes.values() for each in axis.followed):
+            before = known.get(followed.key)
+            self[followed.key] = before if before and before.followed == followed else Surrounding(followed)
+
+    def problems(self, refused: Mapping[str, str], now_ns: int) -> dict[str, str]:
+        """Return what is wrong with a quantity, by name; `refused`: why its topic cannot be followed."""
+        found = {key: refused.get(key) or quantity.problem(now_ns) for key, quantity in self.items()}
+        return {key: problem for key, problem in found.items() if problem}
+
+    def take(self, key: str, value: float, now_ns: int) -> bool:
+        """Take a value of a quantity that came at `now_ns` (ns); return whether it is used."""
+        if key not in self or not self[key].note(value, now_ns):
+            return False
+        for axis in self._axes:
+            axis.surround({key: value})
+        return True

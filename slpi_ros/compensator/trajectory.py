@@ -19,6 +19,8 @@ from slpi_ros.model.streaming import StreamingInverse, refusal
 LATEST_NS = 2**62
 # Number of points converted to lists at once.
 BLOCK = 256
+# Points of a trajectory that are looked at before it begins, and with each sample of it: some microseconds each.
+CHECKED_FIRST, CHECKED_LATER = 500, 50
 
 
 @dataclass(frozen=True)
@@ -215,7 +217,9 @@ class TrajectoryExecutor:
         self.period, self._place = period, place
         self.skipped = 0  # points, because a later one was already due
         self.crowded = 0  # of these, closer together than the output period
+        self.too_fast = ""  # the first point that the slew limit will make late; "" if none is known
         self._tracks: list[_Track] = []
+        self._checks: list[PaceCheck] = []
 
     @property
     def on(self) -> bool:
@@ -253,9 +257,18 @@ class TrajectoryExecutor:
         """Whether a pending trajectory has already output a sample."""
         return any(track.begun for track in self._tracks)
 
-    def start(self, trajectory: Trajectory, now_ns: int, delays: Mapping[str, float] | None = None) -> None:
-        """Start a trajectory at once, or when its first point is due; RejectedError if all points are in the past."""
-        # `delays` (s) advance the deadlines of an axis; of the points in the past the last one is executed.
+    def start(
+        self,
+        trajectory: Trajectory,
+        now_ns: int,
+        delays: Mapping[str, float] | None = None,
+        streams: Mapping[str, StreamingInverse] | None = None,
+    ) -> None:
+        """Start a trajectory at once, or when its first point is due; RejectedError if all points are in the past.
+
+        `delays` (s) advance the deadlines of an axis; of the points in the past the last one is executed. With the
+        inverses `streams` of its axes, the points that their slew limits will make late are looked for.
+        """
         useful = trajectory.useful_at(now_ns)
         due = useful.time_from_start_ns + (trajectory.start_ns or now_ns)
         shifts = {name: round((delays or {}).get(name, 0.0) * SECOND_NS) for name in useful.names}
@@ -274,10 +287,21 @@ class TrajectoryExecutor:
         for track in kept:
             track.stop = track.until(begin_ns) if track.next_ns < begin_ns else track.next
         self._tracks = [*(track for track in kept if track.next < track.stop), *tracks]
+        self.too_fast, wait = "", (trajectory.start_ns - now_ns) * 1e-9 if trajectory.start_ns else 0.0
+        self._checks = [
+            PaceCheck(name, streams[name], trajectory, wait, self.period) for name in trajectory.names if streams
+        ]
+        self.look_ahead(CHECKED_FIRST)
+
+    def look_ahead(self, points: int = CHECKED_LATER) -> None:
+        """Look at the next points: whether the slew limit will make one late (`too_fast`)."""
+        for check in self._checks:
+            self.too_fast = self.too_fast or check.look(points)
+        self._checks = [check for check in self._checks if not check.done]
 
     def cancel(self) -> None:
         """Discard all pending points."""
-        self._tracks = []
+        self._tracks, self._checks = [], []
 
     def due(self, now_ns: int) -> Point | None:
         """Return the latest point that is due and not yet returned, or None; to be called until it returns None."""
@@ -296,10 +320,6 @@ class TrajectoryExecutor:
         if track.next == track.stop:
             self._tracks.remove(track)
         return point
-
-
-# Points of a trajectory that are looked at before it begins, and with each sample of it: some microseconds each.
-CHECKED_FIRST, CHECKED_LATER = 500, 50
 
 
 class PaceCheck:

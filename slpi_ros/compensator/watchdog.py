@@ -1,6 +1,6 @@
 """Watchdog of the commands: they have to keep coming."""
 
-from slpi_ros.compensator.ramps import Safety
+from slpi_ros.compensator.motion import Safety
 
 
 class CommandWatchdog:

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
+import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lifecycle_msgs.srv import ChangeState
@@ -26,9 +27,10 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import ok, try_shutdown
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
 
 from slpi_ros.errors import RecordError, SlpiError, UsageError, shown
-from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.io.messages import SECOND_NS, TrajectoryArrays, decode_trajectory
 from slpi_ros.nodes import stop
 from slpi_ros.nodes.stop import SIGNALS, Stop
 
@@ -50,6 +52,25 @@ def as_rclpy_reads(data: bytes) -> tuple[int, Sequence[str], Sequence[float]]:
         return 0, (), ()
     stamp = message.header.stamp
     return stamp.sec * SECOND_NS + stamp.nanosec, message.name, message.position
+
+
+def read_trajectory(data: bytes, field: str = "positions") -> TrajectoryArrays:
+    """Return a serialised JointTrajectory with one `field` of its points.
+
+    One that cannot be read names no axis, and one whose points have different lengths has no columns.
+    """
+    if arrays := decode_trajectory(data, field):
+        return arrays
+    try:
+        message = deserialize_message(data, JointTrajectory)
+    except RuntimeError:
+        return TrajectoryArrays(0, (), np.zeros(1, np.int64), np.zeros((1, 0)))
+    stamp, points = message.header.stamp, message.points
+    times = [point.time_from_start.sec * SECOND_NS + point.time_from_start.nanosec for point in points]
+    rows = [list(getattr(point, field)) for point in points]
+    values = np.array(rows, float) if len(set(map(len, rows))) == 1 else np.zeros((len(rows), 0))
+    start_ns = stamp.sec * SECOND_NS + stamp.nanosec
+    return TrajectoryArrays(start_ns, tuple(message.joint_names), np.array(times, np.int64), values)
 
 
 class DeferredService:

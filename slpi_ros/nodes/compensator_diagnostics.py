@@ -1,7 +1,9 @@
-"""Diagnostics of the compensator on ``/diagnostics``."""
+"""What a compensator tells of itself: on ``/diagnostics``, and each problem once in the log."""
 
+import math
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Collection, Iterable, Iterator
+from typing import NamedTuple
 
 from rclpy.node import Node
 
@@ -15,27 +17,45 @@ from slpi_ros.nodes.common import ERROR, WARN, Diagnostics, Health
 from slpi_ros.nodes.compensator_parameters import CompensatorSettings
 from slpi_ros.nodes.path_learning import OFF, PathLearning
 
-Problem = tuple[bool, bytes, str]
 # Residuals are a constant if their mean is more than the first share of their rms, and have none below the second.
 CONSTANT, NO_CONSTANT = 0.9, 0.3
 # A sample of a trajectory that comes so much later than it should is told, seconds.
 LATE = 0.01
+# Shortest time between two log messages of the same kind, seconds.
+LOG_PERIOD = 5.0
+
+
+class Problem(NamedTuple):
+    """A problem. The log holds one line of each `kind` when it appears; of none if that is ""."""
+
+    kind: str
+    level: bytes
+    text: str
 
 
 class Reporter:
-    """Collect and publish the diagnostics of the compensator."""
+    """Publish the diagnostics of the compensator, and log each problem when it appears."""
 
-    def __init__(self, node: Node, controller: Controller) -> None:
+    def __init__(
+        self,
+        node: Node,
+        controller: Controller,
+        learning: PathLearning,
+        settings: Callable[[], CompensatorSettings],
+    ) -> None:
         self.finalized = False  # the node has been shut down
         self.timing, self.lateness = Timing(), Timing()  # latency of messages; deadline error of trajectory points
-        self.last_rejection = self.model_error = self.model_id = ""  # reasons; fingerprint
-        self.models_refused = 0
-        self.lost = self.worked_off = self.largest_backlog = 0  # messages: by the middleware, of a backlog
+        self.last_rejection = "", ""  # cause and reason
+        self.model_error = self.model_id = ""  # reason; fingerprint
         self.others: list[str] = []  # nodes that also publish the voltages
-        self.surroundings: dict[str, str] = {}  # what is wrong with a quantity that the stage follows
-        self.age: float | None = None  # s, of the last answered command by its stamp
-        self._controller = controller
-        self._diagnostics = Diagnostics(node, "compensator")
+        self.quantities: dict[str, str] = {}  # what is wrong with a quantity that the stage follows
+        self.age: float | None = None  # s, of the last answered command by its stamp; None: wanted
+        self._out_of_reach = ""
+        self._controller, self._learning, self._settings = controller, learning, settings
+        self._logger, self._diagnostics = node.get_logger(), Diagnostics(node, "compensator")
+        self._logged: dict[str, float] = {}  # time (s) of the last message, by kind
+        self._present: Collection[str] = ()  # kinds of problems in the last report
+        self._remarks: dict[str, str] = {}  # the last one, by kind
         self.start_window()
 
     @property
@@ -43,37 +63,71 @@ class Reporter:
         """Diagnostic level of the last report."""
         return self._diagnostics.level
 
-    def report(self, settings: CompensatorSettings, learning: PathLearning) -> None:
-        """Publish the diagnostics."""
-        model = self._controller.model
+    @property
+    def settings(self) -> CompensatorSettings:
+        """Settings of the node in use."""
+        return self._settings()
+
+    def report(self) -> None:
+        """Publish the diagnostics, and log what is new."""
+        model, settings = self._controller.model, self.settings
         values = self._counters() | self._timing_values() | self._model_values(model)
-        if learning.mode != OFF:
-            values |= _learning_values(learning)
+        if self._learning.mode != OFF:
+            values |= _learning_values(self._learning)
         if model:
             for axis in self._controller.axes:
                 values |= _axis_values(axis, model.created)
                 values[f"{axis.name}.start_voltage"] = self._controller.ownership.notes.get(axis.name, "")
             now_ns = time.monotonic_ns()
-            for key, one in self._controller.surroundings.items():
-                age = one.age_ns(now_ns)
-                values[f"{key}.value"] = f"{one.value:.6g}" if age is not None else ""
+            for key, quantity in self._controller.surroundings.items():
+                age = quantity.age_ns(now_ns)
+                values[f"{key}.value"] = f"{quantity.value:.6g}" if age is not None else ""
                 values[f"{key}.age_s"] = f"{age * 1e-9:.3f}" if age is not None else ""
-        problems = tuple((level, text) for wrong, level, text in self._problems(settings) if wrong)
-        for name, progress in learning.progress.items():
-            if progress.held:
-                problems = (*problems, (WARN, f"axis '{name}': learning is {progress.limited_by}"))
+        problems = list(self._problems(settings))
+        self._log(problems)
         hardware_id = settings.values["hardware_id"] or (model.hardware_id if model else "")
-        self._diagnostics.report(Health(problems, self._summary(), values, hardware_id))
+        told = tuple((each.level, each.text) for each in problems)
+        self._diagnostics.report(Health(told, self._summary(), values, hardware_id))
+        self.age = None
+
+    def remark(self, kind: str, text: str) -> None:
+        """Log a remark, unless the last one of its kind was the same; "": there is none any more."""
+        if text and text != self._remarks.get(kind):
+            self._logger.warning(text)
+        self._remarks[kind] = text
 
     def start_window(self) -> None:
         """Start a new reporting period."""
         self._window, self._window_start = self._controller.counts.copy(), time.perf_counter()
-        self._lost_before = self.lost
         trajectory = self._controller.trajectory
-        self._skipped_before, self._crowded_before = trajectory.skipped, trajectory.crowded
+        self._points_before = trajectory.skipped, trajectory.crowded
         self._beyond_before = {axis.name for axis in self._controller.axes if axis.path.beyond}
         self.timing.restart()
         self.lateness.restart()
+
+    def note_out_of_reach(self) -> None:
+        """Keep which displacements cannot be reached now, and what to do."""
+        held = [axis for axis in self._controller.axes if axis.held]
+        out = [f"axis {axis.name}{_reach(axis)}" for axis in held]
+        remedy = "send displacements within the identified range"
+        if all(_in_range(axis) for axis in held):
+            remedy = (
+                "that is within the range: send a slower path, one further from its ends, or widen voltage_min and "
+                "voltage_max if they are narrower than the model"
+            )
+        self._out_of_reach = f"desired displacement out of reach: {', '.join(out)}; {remedy}"
+
+    def _log(self, problems: Iterable[Problem]) -> None:
+        now, present = time.monotonic(), {each.kind: each for each in problems if each.kind}
+        for kind, (_, level, text) in present.items():
+            if kind not in self._present and now - self._logged.get(kind, -math.inf) >= LOG_PERIOD:
+                # Not in one line: a call of the logger keeps its severity.
+                if level == ERROR:
+                    self._logger.error(text)
+                else:
+                    self._logger.warning(text)
+                self._logged[kind] = now
+        self._present = present.keys()
 
     @property
     def _state(self) -> str:
@@ -110,10 +164,10 @@ class Reporter:
         yet = "" if watchdog.commanded else " yet"
         return f"no command{yet} for {watchdog.silence(time.monotonic_ns()):.3g} s; voltages {reaction}"
 
-    def late(self) -> str:
+    def _late(self) -> str:
         """Return what a trajectory lost since the last periodic report, and why; "" if nothing."""
         trajectory, report = self._controller.trajectory, self.lateness.report()
-        skipped, crowded = trajectory.skipped - self._skipped_before, trajectory.crowded - self._crowded_before
+        skipped, crowded = trajectory.skipped - self._points_before[0], trajectory.crowded - self._points_before[1]
         points = "1 point" if skipped == 1 else f"{skipped} points"
         said = f"{points} of a trajectory skipped, as the next one was already due"
         if 2 * crowded > skipped:
@@ -138,15 +192,16 @@ class Reporter:
             **{f"rejected.{cause}": count for cause, count in counts.by_cause.items()},
             "measurements_rejected": counts.measurements_rejected,
             **{f"measurements_rejected.{cause}": count for cause, count in counts.measured_by_cause.items()},
-            "last_rejection": self.last_rejection,
+            "last_rejection": self.last_rejection[1],
             "held_at_limit": counts.held_at_limit,
             "excursions": counts.excursions,
             "slew_limited": counts.slew_limited,
             "trajectories": counts.trajectories,
-            "messages_lost": self.lost,
-            "worked_off": self.worked_off,
-            "largest_backlog": self.largest_backlog,
+            "messages_lost": counts.lost,
+            "worked_off": counts.worked_off,
+            "largest_backlog": counts.largest_backlog,
             "age_of_answered_ms": f"{self.age * 1e3:.3f}" if self.age is not None else "",
+            "stopped": self._controller.stopped.value if self._controller.stopped else "",
             "trajectories_rejected": counts.trajectories_rejected,
             "points_remaining": self._controller.trajectory.remaining,
             "points_skipped": self._controller.trajectory.skipped,
@@ -181,50 +236,69 @@ class Reporter:
             "model.age_h": _hours_since(model.created) if model else "",
             "model.hardware_id": model.hardware_id if model else "",
             "model.kind": ", ".join(kinds),
-            "models_refused": self.models_refused,
+            "models_refused": self._controller.counts.models_refused,
             "last_model_error": self.model_error,
         }
 
     def _problems(self, settings: CompensatorSettings) -> Iterator[Problem]:
-        """Yield every possible problem, with whether it is present or was counted since the last periodic report."""
-        counts, window = self._controller.counts, self._window
-        ready, active = self._controller.model is not None, self._controller.active
-        yield self.model_error != "", WARN if ready else ERROR, f"model refused: {self.model_error}"
-        yield active and not ready, WARN, "waiting for a model"
-        rejected = counts.rejected - window.rejected
-        yield rejected > 0, WARN, f"{rejected} messages rejected, the last: {self.last_rejection}"
-        refused = counts.trajectories_rejected - window.trajectories_rejected
-        yield refused > 0, WARN, f"{refused} trajectories rejected, the last: {self.last_rejection}"
-        unused = counts.measurements_rejected - window.measurements_rejected
-        yield unused > 0, WARN, f"{unused} measurements rejected, the last: {self.last_rejection}"
-        held = counts.held_at_limit - window.held_at_limit
-        yield held > 0, WARN, f"{held} times held at a voltage limit"
-        jumps = counts.time_jumps - window.time_jumps
-        yield jumps > 0, WARN, f"the clock of the stamps was set back {jumps} times"
-        points = counts.points_held - window.points_held
-        yield points > 0, WARN, f"{points} points of a trajectory held at a voltage limit"
-        late = self.late()
-        yield late != "", WARN, late
-        lost = self.lost - self._lost_before
-        yield lost > 0, WARN, f"{lost} messages lost by the middleware; send fewer, or make its queue deeper"
-        ownership = self._controller.ownership
+        """Yield all problems: those that are present, and what was counted since the last periodic report."""
+        controller, counts, window = self._controller, self._controller.counts, self._window
+        ready, active, (cause, reason) = controller.model is not None, controller.active, self.last_rejection
+        if self.model_error:
+            yield Problem("model", WARN if ready else ERROR, f"model refused: {self.model_error}")
+        if active and not ready:
+            yield Problem("", WARN, "waiting for a model")
+        for what, now, before in (
+            ("messages", counts.rejected, window.rejected),
+            ("trajectories", counts.trajectories_rejected, window.trajectories_rejected),
+            ("measurements", counts.measurements_rejected, window.measurements_rejected),
+        ):
+            if now > before:
+                yield Problem(f"{what} {cause}", WARN, f"{now - before} {what} rejected, the last: {reason}")
+        if held := counts.held_at_limit - window.held_at_limit:
+            yield Problem("held", WARN, f"{held} times held at a voltage limit: {self._out_of_reach}")
+        if jumps := counts.time_jumps - window.time_jumps:
+            yield Problem("", WARN, f"the clock of the stamps was set back {jumps} times")
+        if points := counts.points_held - window.points_held:
+            said = f"{points} points of a trajectory held at a voltage limit: {self._out_of_reach}"
+            yield Problem("held", WARN, said)
+        if late := self._late():
+            yield Problem("late", WARN, late)
+        if lost := counts.lost - window.lost:
+            yield Problem("", WARN, f"{lost} messages lost by the middleware; send fewer, or make its queue deeper")
         if ready and active:
-            obstacle = ownership.obstacle
-            yield obstacle is not None, WARN if ownership.armed else ERROR, obstacle[1] if obstacle else ""
+            yield from self._ownership_problems()
+        if self.others:
+            others = ", ".join(self.others)
+            said = f"{others} also publishes voltage_command; stop it, or the voltage jumps between both"
+            yield Problem("", WARN, said)
+        for key, said in self.quantities.items():
+            yield Problem(key, WARN, said)
+        if too_fast := controller.trajectory.too_fast:
+            yield Problem("too fast", WARN, f"trajectory {too_fast}; send it more slowly, or raise slew_limit")
+        if silence := self._silence():
+            yield Problem("", WARN, silence)
+        for axis in controller.axes if ready else ():
+            beyond, moving = axis.path.beyond, counts.accepted > window.accepted
+            if beyond and axis.name not in self._beyond_before:
+                advice = "errors may be larger than told, record at that rate (slpi excite --for-path)"
+                yield Problem(f"{axis.name} beyond", WARN, f"axis '{axis.name}': {beyond}; {advice}")
+            for kind, level, text in _axis_problems(axis, settings.values["drift_alarm"], moving):
+                yield Problem(f"{axis.name} {kind}" if kind else "", level, f"axis '{axis.name}'{text}")
+        for name, progress in self._learning.progress.items():
+            if progress.held:
+                text = f"axis '{name}': learning is {progress.limited_by}; call ~/forget"
+                yield Problem(f"{name} learning", WARN, text)
+
+    def _ownership_problems(self) -> Iterator[Problem]:
+        ownership = self._controller.ownership
+        if ownership.obstacle:
+            level = WARN if ownership.armed else ERROR
+            yield Problem("" if ownership.armed else "not armed", level, ownership.obstacle[1])
+        elif not ownership.started:
             for name, note in ownership.notes.items():
-                yield note != "" and obstacle is None and not ownership.started, WARN, f"axis '{name}': {note}"
-        others = ", ".join(self.others)
-        yield others != "", WARN, f"{others} also publishes voltage_command; stop it, or the voltage jumps between both"
-        for said in self.surroundings.values():
-            yield True, WARN, said
-        yield self._controller.too_fast != "", WARN, f"trajectory {self._controller.too_fast}"
-        silence = self._silence()
-        yield silence != "", WARN, silence
-        if ready:
-            for axis in self._controller.axes:
-                beyond = axis.path.beyond
-                yield beyond != "" and axis.name not in self._beyond_before, WARN, f"axis '{axis.name}': {beyond}"
-                yield from _axis_problems(axis, settings.values["drift_alarm"], counts.accepted > window.accepted)
+                if note:
+                    yield Problem("", WARN, f"axis '{name}': {note}")
 
 
 def _microseconds(report: TimingReport | None) -> tuple[str, str, str]:
@@ -234,7 +308,7 @@ def _microseconds(report: TimingReport | None) -> tuple[str, str, str]:
 
 
 def _axis_values(axis: Axis, created: str) -> dict[str, object]:
-    drift, quality = axis.drift, axis.model.quality if axis.model else None
+    drift, quality = axis.loop.drift, axis.model.quality if axis.model else None
     values = {
         "voltage_V": f"{axis.voltage:.4f}",
         "memory": axis.confidence.state,
@@ -242,12 +316,12 @@ def _axis_values(axis: Axis, created: str) -> dict[str, object]:
         "beyond_record": axis.path.beyond,
         "covered": f"{quality.covered:.3f}" if quality else "",
         "held_out_rms_nm": f"{quality.held_out_rms * 1e9:.2f}" if quality else "",
-        "feedback": axis.feedback_state,
-        "correction_V": f"{axis.correction:.4f}",
+        "feedback": axis.loop.state,
+        "correction_V": f"{axis.loop.correction:.4f}",
         "reported_V": "" if axis.amplifier.latest is None else f"{axis.amplifier.latest:.4f}",
         "report_gain": f"{axis.amplifier.calibration.gain:.5g}",
         "report_offset_V": f"{axis.amplifier.calibration.offset:.4g}",
-        "feedback_fault": axis.fault.kind if axis.fault else "",
+        "feedback_fault": axis.loop.fault.kind if axis.loop.fault else "",
         "residual_rms_nm": f"{drift.rms * 1e9:.2f}" if drift else "",
         "residual_mean_nm": f"{drift.mean * 1e9:.2f}" if drift else "",
         "zero_from": axis.zero.source,
@@ -258,23 +332,49 @@ def _axis_values(axis: Axis, created: str) -> dict[str, object]:
 
 
 def _axis_problems(axis: Axis, factor: float, moving: bool) -> Iterator[Problem]:
-    yield moving and axis.feedback_state == "holding", WARN, f"axis '{axis.name}': feedback holds, measurement too old"
-    if axis.fault:
-        fault = f"feedback is off, the sensor is {axis.fault.kind}: {axis.fault.reason}; set feedback to true again"
-        yield True, ERROR, f"axis '{axis.name}': {fault}"
-    yield axis.amplifier.silent, WARN, f"axis '{axis.name}': stage_state no longer reports its voltage (effort)"
-    saturated = f"axis '{axis.name}': the feedback is at correction_limit, {axis.correction:.4g} V"
-    yield moving and axis.feedback_state == "saturated", WARN, saturated
-    yield axis.confidence.contradicted, WARN, f"axis '{axis.name}': {axis.confidence.doubt}"
-    drift, quality = axis.drift, axis.model.quality if axis.model else None
+    """Yield the problems of an axis; the texts go on behind its name."""
+    loop, drift, quality = axis.loop, axis.loop.drift, axis.model.quality if axis.model else None
+    if moving and loop.state == "holding":
+        yield Problem("", WARN, ": feedback holds, measurement too old")
+    if loop.fault:
+        fault = (
+            f": feedback is off, the sensor is {loop.fault.kind}: {loop.fault.reason}; the model goes on alone; repair "
+            "the sensor, then set feedback to true again"
+        )
+        yield Problem("sensor", ERROR, fault)
+    if axis.amplifier.silent:
+        yield Problem("", WARN, ": stage_state no longer reports its voltage (effort)")
+    if moving and loop.state == "saturated":
+        yield Problem("", WARN, f": the feedback is at correction_limit, {loop.correction:.4g} V")
+    if axis.confidence.contradicted:
+        yield Problem("", WARN, f": {axis.confidence.doubt}")
     # Before the end of a reset the model has another memory than the stage.
     if drift and quality and axis.confidence.state != RESETTING:
         usual = max(quality.held_out_rms, quality.floor_rms)
-        text = (
-            f"axis '{axis.name}' is off its model by {drift.rms * 1e9:.1f} nm rms, mean {drift.mean * 1e9:.1f} nm, in "
-            f"{drift.samples} measurements; held-out error {usual * 1e9:.1f} nm: {remedy(axis, drift)}"
-        )
-        yield 0.0 < factor * usual < drift.rms, WARN, text
+        if 0.0 < factor * usual < drift.rms:
+            text = (
+                f" is off its model by {drift.rms * 1e9:.1f} nm rms, mean {drift.mean * 1e9:.1f} nm, in "
+                f"{drift.samples} measurements; held-out error {usual * 1e9:.1f} nm: {remedy(axis, drift)}"
+            )
+            yield Problem("", WARN, text)
+
+
+def _reach(axis: Axis) -> str:
+    """Return the desired displacement of an axis beside the identified range as text."""
+    desired, model = axis.tracking.desired, axis.model
+    if desired is None or model is None:
+        return ""
+    low, high = model.displacement_range
+    return f" at {desired * 1e6:.5g} of {low * 1e6:.5g} to {high * 1e6:.5g} µm"
+
+
+def _in_range(axis: Axis) -> bool:
+    """Return whether the desired displacement of an axis is in the identified range: what is too much is its rate."""
+    desired, model = axis.tracking.desired, axis.model
+    if desired is None or model is None:
+        return False
+    low, high = model.displacement_range
+    return low <= desired <= high
 
 
 def _learning_values(learning: PathLearning) -> dict[str, object]:

@@ -7,8 +7,8 @@ from math import inf, nan
 from typing import Any
 
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
+from slpi_ros.compensator.motion import Safety
 from slpi_ros.compensator.ownership import STARTS
-from slpi_ros.compensator.ramps import Safety
 from slpi_ros.compensator.validation import TimestampRules
 from slpi_ros.errors import UsageError
 from slpi_ros.model.axis_model import START_MEMORIES

@@ -1,5 +1,6 @@
 """Subscriptions to the quantities that a stage follows: the topics of the model, or those of a parameter."""
 
+import time
 from collections.abc import Sequence
 from functools import partial
 from typing import Any
@@ -16,9 +17,8 @@ from slpi_ros.nodes.common import MEASUREMENTS, message_class
 class SurroundingsTopics:
     """Subscribe to the quantities of the controller's model as soon as the graph tells their types."""
 
-    # `take` is called with the name of a quantity and its value.
-    def __init__(self, node: Node, controller: Controller, take: Any) -> None:
-        self._node, self._controller, self._take = node, controller, take
+    def __init__(self, node: Node, controller: Controller) -> None:
+        self._node, self._controller = node, controller
         self._subscriptions: dict[str, tuple[str, Any]] = {}  # by quantity: full name of its topic, subscription
         self.refused: dict[str, str] = {}  # why there is none, by quantity
 
@@ -57,7 +57,7 @@ class SurroundingsTopics:
     def _on_message(self, key: str, msgtype: str, field: str, data: bytes) -> None:
         value = value_of(data, msgtype, field)
         if value is not None:
-            self._take(key, value)
+            self._controller.surroundings.take(key, value, time.monotonic_ns())
 
     def _leave(self, key: str) -> None:
         self._node.destroy_subscription(self._subscriptions.pop(key)[1])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from strategies import FAMILY_CASE, axis_model
 
-from slpi_ros.compensator.amplifier import Amplifier
+from slpi_ros.compensator.amplifier import REARM_NS, Amplifier
 from slpi_ros.compensator.controller import Controller
 from slpi_ros.compensator.ownership import MEASURED, SAVED
 from slpi_ros.compensator.persistence import SavedAxis
@@ -289,7 +289,7 @@ def test_rearm_takes_half_a_second_of_steady_reports():
     owned.foreign, owned.there = True, 75.0
     owned.run(0.2)
     begin = owned.now_ns
-    while not owned.made.rearm(owned.now_ns):
+    while owned.made.arm(owned.now_ns, REARM_NS):
         owned.run(0.005)
         assert owned.now_ns - begin < 10**9
     assert owned.made.voltages[0] == 75.0

@@ -77,8 +77,8 @@ def test_the_memory_follows_what_was_really_played(share):
     count = round(share * len(block.voltages))
     before = memory(made)
     for sample in range(0, count, 100):
-        assert not made.told(STAMP, PLAYING, sample, "", 2 * 10**9 + sample)
-    assert made.told(STAMP, ENDED if share == 1.0 else STOPPED, count, "", 4 * 10**9)
+        assert not made.hear_block(STAMP, PLAYING, sample, "", 2 * 10**9 + sample)
+    assert made.hear_block(STAMP, ENDED if share == 1.0 else STOPPED, count, "", 4 * 10**9)
     assert made.mode is OperatingMode.STREAMING
     stream = other.axes[0].stream
     for v in block.voltages[:count, 0]:
@@ -115,9 +115,9 @@ def test_while_it_is_played_nothing_else_moves():
 def test_what_is_told_of_another_block_does_not_count():
     made = prepared()
     block_of(made)
-    assert not made.told(STAMP - 1, ENDED, 10, "", 3 * 10**9) and made.mode is OperatingMode.BLOCK
-    assert made.told(STAMP, REFUSED, 0, "too long", 3 * 10**9) and made.block.reason == "too long"
-    assert not made.told(STAMP, ENDED, 10, "", 3 * 10**9)
+    assert not made.hear_block(STAMP - 1, ENDED, 10, "", 3 * 10**9) and made.mode is OperatingMode.BLOCK
+    assert made.hear_block(STAMP, REFUSED, 0, "too long", 3 * 10**9) and made.block.reason == "too long"
+    assert not made.hear_block(STAMP, ENDED, 10, "", 3 * 10**9)
 
 
 def test_no_driver_answers():
@@ -131,7 +131,7 @@ def test_no_driver_answers():
 def test_a_driver_that_falls_silent_needs_to_be_armed():
     made = prepared()
     block_of(made)
-    made.told(STAMP, PLAYING, 50, "", 3 * 10**9)
+    made.hear_block(STAMP, PLAYING, 50, "", 3 * 10**9)
     assert "sample 50" in made.watch_block(3 * 10**9 + PATIENCE_NS)
     with pytest.raises(RejectedError, match="sample 50"):
         made.update(STAMP, ["x"], [float(path_of(made)[1][0])], 6 * 10**9)
@@ -146,12 +146,12 @@ def test_reports_of_a_block_are_no_other_hand():
     begun = 2 * 10**9
     for sample in range(0, len(block.voltages), 50):
         now = begun + sample * 1_000_000
-        made.told(STAMP, PLAYING, sample, "", now)
+        made.hear_block(STAMP, PLAYING, sample, "", now)
         assert made.watch_block(now) == ""
         for more in range(0, 50, 5):
             at = min(sample + more, len(block.voltages) - 1)
             assert not made.report(["x"], [float(block.voltages[at, 0])], now + more * 1_000_000)
-    assert made.told(STAMP, ENDED, len(block.voltages), "", now + 50_000_000)
+    assert made.hear_block(STAMP, ENDED, len(block.voltages), "", now + 50_000_000)
     assert made.ownership.owned
 
 
@@ -162,7 +162,7 @@ def test_an_axis_that_is_not_named_stays_and_effects_go_on():
     voltage = made.voltages[1]
     block, _ = block_of(made)
     assert block.names == ("x",)
-    made.told(STAMP, ENDED, len(block.voltages), "", 5 * 10**9)
+    made.hear_block(STAMP, ENDED, len(block.voltages), "", 5 * 10**9)
     assert made.voltages[1] == voltage and made.voltages[0] == block.voltages[-1, 0]
     assert made.axes[0].stream.relaxing(0.0)["creep"] != (0.0,)
 
@@ -170,7 +170,7 @@ def test_an_axis_that_is_not_named_stays_and_effects_go_on():
 def test_a_path_that_is_too_fast_is_told():
     made = prepared(slew=20.0)
     block, _ = block_of(made)
-    assert "too fast" in block.missed and made.too_fast == block.missed
+    assert "too fast" in block.missed and made.trajectory.too_fast == block.missed
     assert np.abs(np.diff(block.voltages[:, 0])).max() <= 20.0 * block.period * (1.0 + 1e-9)
 
 

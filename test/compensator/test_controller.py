@@ -222,7 +222,7 @@ def test_limits_outside_of_what_was_identified_are_refused():
 ])  # fmt: skip
 def test_a_sample_that_is_older_than_allowed_is_stale(max_age, age, taken):
     made = compensation()
-    made.use_time(TimestampRules(max_age=max_age))
+    made.messages.use(TimestampRules(max_age=max_age))
     arrival = START_NS + round(age * 1e9)
     if taken:
         made.update(START_NS, ["x"], [4e-6], arrival, arrival)

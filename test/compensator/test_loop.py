@@ -8,7 +8,7 @@ from strategies import FAMILY_CASE, PI_CASE, axis_model
 
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.feedback import ENOUGH, WINDOW, LoopSettings, PidGains, ResidualWindow
-from slpi_ros.compensator.ramps import Ramp
+from slpi_ros.compensator.motion import Kind, Ramp
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.model.limits import Limits
@@ -26,7 +26,7 @@ class Bench:
 
     def __init__(self, settings: LoopSettings, offset: float = 0.0, limits: Limits = LIMITS) -> None:
         self.now_ns = 0
-        self.axis = Axis("x", 0, limits, settings)
+        self.axis = Axis("x", limits, settings)
         self.axis.use(MODEL, self.axis.prepare(MODEL))
         self.stage, self.offset = FAMILY_CASE.memory(), offset
         self.measured = self.stage.forward(offset)
@@ -60,8 +60,8 @@ def test_feedback_takes_away_what_the_model_does_not_know():
     late = slice(1000, None)
     without, with_feedback = (np.abs(bench.run(PATH)[late]).mean() for bench in (alone, corrected))
     assert without > 2e-7 and with_feedback < without / 20
-    assert alone.axis.feedback_state == "off" and corrected.axis.feedback_state == "on"
-    assert corrected.axis.correction == pytest.approx(-3.0, abs=0.3)
+    assert alone.axis.loop.state == "off" and corrected.axis.loop.state == "on"
+    assert corrected.axis.loop.correction == pytest.approx(-3.0, abs=0.3)
 
 
 def test_a_measurement_is_held_against_the_wish_that_it_answers():
@@ -69,7 +69,7 @@ def test_a_measurement_is_held_against_the_wish_that_it_answers():
     bench = Bench(ON)
     bench.run(START)
     bench.run(np.linspace(PATH[0], 11e-6, 1000))
-    assert abs(bench.axis.correction) < 1e-6
+    assert abs(bench.axis.loop.correction) < 1e-6
 
 
 @pytest.mark.parametrize("enabled", [True, False])
@@ -87,7 +87,7 @@ def test_other_gains_after_a_slope_beyond_reason(enabled):
     assert bench.move(DT, float(START[-1])) == pytest.approx(before, abs=1e-9)
     # Another takes over, and acts.
     bench.run(PATH[:500])
-    assert bench.axis.feedback_state == ("on" if enabled else "off")
+    assert bench.axis.loop.state == ("on" if enabled else "off")
 
 
 def test_without_feedback_measurements_change_no_voltage():
@@ -95,14 +95,14 @@ def test_without_feedback_measurements_change_no_voltage():
     heard.run(PATH)
     deaf.run(PATH, measuring=False)
     assert heard.voltages == pytest.approx(deaf.voltages, abs=1e-12)
-    assert deaf.axis.drift is None and heard.axis.drift.samples == WINDOW
+    assert deaf.axis.loop.drift is None and heard.axis.loop.drift.samples == WINDOW
 
 
 def test_stale_and_absurd_measurements_do_not_act_and_the_correction_stays():
     bench = Bench(ON, 3.0)
     bench.run(START)
     bench.run(PATH[:1000])
-    kept = bench.axis.correction
+    kept = bench.axis.loop.correction
     assert kept < -2.0
     for spoil in (None, np.nan, np.inf, 1e308):
         if spoil is not None:
@@ -111,12 +111,12 @@ def test_stale_and_absurd_measurements_do_not_act_and_the_correction_stays():
         # Between measurements the correction stays; after their timeout that is said.
         bench.now_ns += 101 * MS
         bench.move(DT, float(PATH[1000]))
-        assert bench.axis.feedback_state == "holding"
-        assert bench.axis.correction == pytest.approx(kept, abs=1e-9)
+        assert bench.axis.loop.state == "holding"
+        assert bench.axis.loop.correction == pytest.approx(kept, abs=1e-9)
     bench.axis.measure(9e-6, bench.now_ns)
     bench.now_ns += 200 * MS
     bench.move(DT, PATH[1000])
-    assert bench.axis.feedback_state == "holding"
+    assert bench.axis.loop.state == "holding"
 
 
 @pytest.mark.parametrize("absurd", [17e-6, -1e-6, 1e-3, -1e300, 1e300, np.nan, np.inf])
@@ -134,7 +134,7 @@ def test_a_measurement_that_cannot_be_acts_on_nothing(absurd):
                 assert caught.value.cause == ("out_of_range" if np.isfinite(absurd) else "not_finite")
             each.run(np.array([y]), measuring=False)
     assert bench.voltages == undisturbed.voltages
-    assert bench.axis.drift == undisturbed.axis.drift
+    assert bench.axis.loop.drift == undisturbed.axis.loop.drift
 
 
 @pytest.mark.parametrize("first", [1e-3, np.nan])
@@ -146,7 +146,7 @@ def test_a_measurement_that_cannot_be_does_not_hide_one_that_came_before(first):
     with pytest.raises(RejectedError):
         bench.axis.measure(first, bench.now_ns)
     assert bench.move(DT, PATH[0]) == other.move(DT, PATH[0])
-    assert bench.axis.feedback_state == "on"
+    assert bench.axis.loop.state == "on"
 
 
 def test_switching_the_feedback_makes_no_jump():
@@ -178,10 +178,10 @@ def test_a_new_model_takes_over_without_a_jump_and_keeps_the_correction():
     bench = Bench(ON, 3.0)
     bench.run(START)
     bench.run(PATH[:1000])
-    voltage, correction = bench.axis.voltage, bench.axis.correction
+    voltage, correction = bench.axis.voltage, bench.axis.loop.correction
     other = replace(MODEL, quality=replace(MODEL.quality, rms=1e-9))
     bench.axis.use(other, bench.axis.prepare(other))
-    assert (bench.axis.voltage, bench.axis.correction) == (voltage, correction)
+    assert (bench.axis.voltage, bench.axis.loop.correction) == (voltage, correction)
     bench.run(PATH[1000:1010])
     assert abs(bench.voltages[-10] - voltage) <= 2.0
 
@@ -191,15 +191,15 @@ def test_a_drive_starts_at_the_voltage_in_total_and_the_path_goes_on_from_its_en
     bench.run(START)
     bench.run(PATH[:1000])
     before = bench.axis.voltage
-    bench.axis.start_ramp(Ramp([20.0], 1000.0), bench.now_ns)
+    bench.axis.begin(Ramp([20.0], 1000.0), bench.now_ns)
     way = []
-    while not bench.axis.ramp.done:
+    while bench.axis.motion.kind is Kind.RAMP:
         bench.now_ns += MS
-        bench.axis.step_ramp(bench.now_ns)
+        bench.axis.tick(bench.now_ns)
         way.append(bench.axis.voltage)
     assert abs(way[0] - before) <= 1.0 + 1e-9 and np.abs(np.diff(way)).max() <= 1.0 + 1e-9
-    bench.axis.stop_ramp()
-    assert bench.axis.voltage == 20.0 and bench.axis.correction == 0.0
+    bench.axis.end_ramp(bench.now_ns)
+    assert bench.axis.voltage == 20.0 and bench.axis.loop.correction == 0.0
     assert bench.axis.reversal_voltages[-1] == 20.0
     assert bench.move(0.0, PATH[1000]) == 20.0, "no time has passed since the last step"
     bench.now_ns += MS
@@ -215,9 +215,9 @@ def test_the_health_of_a_stage_as_identified_is_its_noise_and_of_another_more():
         for y in [PATH[0]] * WINDOW:
             bench.axis.measure(bench.measured + rng.normal(0.0, 8e-9), bench.now_ns)
             bench.run(np.array([y]), measuring=False)
-        assert low < bench.axis.drift.rms < high
+        assert low < bench.axis.loop.drift.rms < high
         bench.run(PATH[:WINDOW])
-        assert bench.axis.drift.rms <= high
+        assert bench.axis.loop.drift.rms <= high
 
 
 def test_residuals_are_counted_in_a_window_and_only_outside_of_what_was_expected():
@@ -238,12 +238,12 @@ def test_residuals_are_counted_in_a_window_and_only_outside_of_what_was_expected
 
 
 def test_an_axis_without_a_model_takes_no_measurement():
-    axis = Axis("x", 0, LIMITS, ON)
+    axis = Axis("x", LIMITS, ON)
     axis.measure(1e-6, 0)
-    assert axis.drift is None
+    assert axis.loop.drift is None
     model = axis_model(PI_CASE)
     axis.use(model, axis.prepare(model))
-    assert axis.feedback_state == "holding"
+    assert axis.loop.state == "holding"
 
 
 # The sensor is not the stage
@@ -307,12 +307,12 @@ def test_a_late_sensor_on_a_moving_stage_is_no_error(delay, lag):
     for bench in (known, unknown):
         bench.run(START)
         bench.run(PATH)
-    assert known.axis.feedback_state == "on"
-    assert abs(known.axis.correction) < 1e-6
+    assert known.axis.loop.state == "on"
+    assert abs(known.axis.loop.correction) < 1e-6
     assert known.axis.tracking.report().maximum < 1e-12
-    assert known.axis.drift.rms < 1e-12
+    assert known.axis.loop.drift.rms < 1e-12
     assert unknown.axis.tracking.report().maximum > 1e-8
-    assert abs(unknown.axis.correction) > 1e-4
+    assert abs(unknown.axis.loop.correction) > 1e-4
 
 
 @pytest.mark.parametrize(("delay", "lag"), [(0, 0.0), (7, 0.0), (7, 0.005)])
@@ -323,21 +323,21 @@ def test_a_slow_sensor_does_not_hide_what_the_model_lacks(delay, lag):
     for k in range(0, PATH.size, 10):
         bench.run(PATH[k : k + 9], measuring=False)
         bench.run(PATH[k + 9 : k + 10])
-    assert bench.axis.drift.rms > 2e-7
+    assert bench.axis.loop.drift.rms > 2e-7
 
 
 def test_a_late_reading_from_before_the_path_corrects_nothing():
     bench = SensedBench(ON, 0.0, 20, 0.0)
     bench.run(START[:15])
-    assert bench.axis.feedback_state == "holding" and not bench.axis.tracking.fresh
+    assert bench.axis.loop.state == "holding" and not bench.axis.tracking.fresh
     bench.run(START[15:30])
-    assert bench.axis.feedback_state == "on" and bench.axis.tracking.fresh
-    bench.axis.start_ramp(Ramp([60.0], 1000.0), bench.now_ns)
-    while not bench.axis.ramp.done:
+    assert bench.axis.loop.state == "on" and bench.axis.tracking.fresh
+    bench.axis.begin(Ramp([60.0], 1000.0), bench.now_ns)
+    while bench.axis.motion.kind is Kind.RAMP:
         bench.now_ns += MS
-        bench.axis.step_ramp(bench.now_ns)
+        bench.axis.tick(bench.now_ns)
         bench.axis.measure(6e-6, bench.now_ns)
-    bench.axis.stop_ramp()
+    bench.axis.end_ramp(bench.now_ns)
     bench.axis.tracking.report()
     bench.now_ns += MS
     bench.move(DT, 8e-6)
@@ -346,4 +346,4 @@ def test_a_late_reading_from_before_the_path_corrects_nothing():
     bench.axis.measure(5e-6, bench.now_ns)
     assert not bench.axis.tracking.fresh
     bench.move(DT, 8e-6)
-    assert bench.axis.correction == 0.0 and bench.axis.feedback_state == "holding"
+    assert bench.axis.loop.correction == 0.0 and bench.axis.loop.state == "holding"

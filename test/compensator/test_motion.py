@@ -11,7 +11,7 @@ rclpy = pytest.importorskip("rclpy")
 from nodes.ros_helpers import stage_model  # noqa: E402
 
 from benchmarks.episodes import Ratios, Wire  # noqa: E402
-from slpi_ros.compensator.controller import Controller  # noqa: E402
+from slpi_ros.compensator.controller import Controller, StopReason  # noqa: E402
 from slpi_ros.compensator.feedback import LoopSettings, PidGains  # noqa: E402
 from slpi_ros.compensator.validation import RejectedError  # noqa: E402
 from slpi_ros.model.limits import Limits  # noqa: E402
@@ -37,7 +37,8 @@ class Bench:
     def publish(self):
         self.given.append((self.now_ns, *self.controller.voltages))
         for wire, voltage, axis in zip(self.wires, self.controller.voltages, self.controller.axes, strict=True):
-            wire.output(voltage, self.now_ns, self.ratios, f"output {len(self.given)}", axis.given_ns == self.now_ns)
+            meant = self.now_ns in (axis.samples.given_ns, axis.loop.driven_ns)
+            wire.output(voltage, self.now_ns, self.ratios, f"output {len(self.given)}", meant)
 
     def advance(self):
         """Do what is due."""
@@ -72,7 +73,7 @@ class Bench:
     def end(self, ramp_to=None):
         """Hold, or go to a voltage, as an end of activity does."""
         if ramp_to is None:
-            self.controller.hold(self.now_ns)
+            self.controller.stop(StopReason.DEACTIVATED, self.now_ns)
         else:
             self.controller.ramp([ramp_to] * len(self.controller.axes), 50.0, self.now_ns)
         while self.controller.ramping:
@@ -130,7 +131,7 @@ def test_a_command_that_interrupts_a_ramp(bench, wish, late, feedback):
     made.run(1.0)
     made.ramp()
     made.run(0.12 + late)
-    assert made.controller.axes[0].in_motion
+    assert made.controller.axes[0].output.in_motion
     made.wish(wish)
     made.send(1.5, wish)
     made.check()
@@ -182,7 +183,7 @@ def test_a_trajectory_that_leaves_an_axis_in_motion(bench, how, feedback):
         made.run(1.0)
         made.follow(np.linspace(0.0, TOP, 41)[1:], names=("x", "y"))
         made.run(0.25)
-    assert made.controller.axes[0].in_motion
+    assert made.controller.axes[0].output.in_motion
     if how == "cancel":
         made.cancel()
     elif how == "replace":
@@ -219,7 +220,7 @@ def test_a_command_replaces_the_goal_of_one_that_is_under_way(bench):
     made = bench()
     made.wish(TOP)
     made.run(0.1)
-    assert made.controller.axes[0].in_motion
+    assert made.controller.axes[0].output.in_motion
     made.wish(2e-6)
     made.run(1.0)
     made.check()

@@ -11,8 +11,8 @@ from strategies import FAMILY_CASE, axis_model
 
 from benchmarks.episodes import Episode, Ratios, Wire
 from slpi_ros.compensator.controller import Controller, OperatingMode
+from slpi_ros.compensator.motion import Kind, Safety
 from slpi_ros.compensator.persistence import MemoryFile, SavedAxis
-from slpi_ros.compensator.ramps import Safety
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.lag import Lag
 from slpi_ros.errors import ModelError
@@ -225,7 +225,7 @@ def test_a_single_set_point_settles_although_the_stage_lags_and_creeps():
     stage.given.clear()
     stage.run(60.0)
     assert len(stage.given) <= 61
-    assert stage.axis.holding
+    assert stage.axis.motion.kind is Kind.HOLD
 
 
 def test_a_timeout_holds_the_voltage_and_not_the_displacement():
@@ -233,14 +233,14 @@ def test_a_timeout_holds_the_voltage_and_not_the_displacement():
     stage = Stage(model=SETTLING, limits=replace(LIMITS, slew=1000.0))
     stage.send(0.6 * TOP)
     stage.run(0.5)
-    assert stage.axis.holding and len(set(stage.given[-20:])) == 20
-    assert stage.made.watch(Safety(0.4, False, False, (0.0,), 50.0), stage.now_ns)
+    assert stage.axis.motion.kind is Kind.HOLD and len(set(stage.given[-20:])) == 20
+    assert stage.made.watch(Safety(0.4, False, False, (0.0,), 50.0), 0.0, stage.now_ns)
     stage.given.clear()
     stage.run(5.0)
-    assert not stage.given and not stage.axis.holding
+    assert not stage.given and stage.axis.motion.kind is not Kind.HOLD
     stage.send(0.6 * TOP)
     stage.run(4.0)
-    assert stage.axis.holding
+    assert stage.axis.motion.kind is Kind.HOLD
     stage.check()
 
 
@@ -252,7 +252,7 @@ def test_a_hold_begins_after_three_intervals_and_never_between_samples(interval_
         sent = len(stage.given)
         if k > 3:
             stage.run(interval_ms * 1e-3 - 1e-9)
-            assert len(stage.given) == sent and not stage.axis.holding
+            assert len(stage.given) == sent and stage.axis.motion.kind is not Kind.HOLD
             stage.run(1e-9)
         else:
             stage.run(interval_ms * 1e-3)

@@ -9,9 +9,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import FAMILY_CASE, axis_model, cases, fractions, paths, stream_forward
 
-from slpi_ros.compensator.controller import Controller, OperatingMode
+from slpi_ros.compensator.controller import Controller, OperatingMode, StopReason
+from slpi_ros.compensator.motion import Ramp
 from slpi_ros.compensator.persistence import ASSUMED, INTERRUPTED, KNOWN, RESETTING, MemoryConfidence
-from slpi_ros.compensator.ramps import Ramp
 from slpi_ros.errors import UsageError
 from slpi_ros.model.limits import Limits, RateLimiter, decaying_turns
 from slpi_ros.model.stage_model import StageModel
@@ -24,7 +24,7 @@ def drive(ramp: Ramp, v: float, limits: Limits, dt: float = 0.01) -> list[float]
     pace, way = RateLimiter(limits, dt, v), []
     pace.begin(0)
     while not ramp.done:
-        v = ramp.step(pace, round((len(way) + 1) * dt * 1e9))
+        v = ramp.next(pace, round((len(way) + 1) * dt * 1e9))
         way.append(v)
         assert len(way) < 100_000
     return way
@@ -89,7 +89,7 @@ def test_a_ramp_takes_the_time_its_rate_tells():
 
 def test_a_late_step_of_a_ramp_makes_up_for_one_output_period_and_no_more():
     pace, ramp = RateLimiter(LIMITS, 0.01, 40.0), Ramp([90.0], 50.0)
-    assert [ramp.step(pace, 0), ramp.step(pace, 7 * 10**9)] == [41.0, 42.0]
+    assert [ramp.next(pace, 0), ramp.next(pace, 7 * 10**9)] == [41.0, 42.0]
 
 
 def test_ramps_are_planned_at_four_fifths_of_the_slew_limit():
@@ -99,7 +99,7 @@ def test_ramps_are_planned_at_four_fifths_of_the_slew_limit():
 
 def test_a_ramp_that_is_done_stays():
     ramp = Ramp([], 1.0)
-    assert ramp.done and ramp.step(RateLimiter(LIMITS, 0.1, 33.0), 0) == 33.0
+    assert ramp.done and ramp.next(RateLimiter(LIMITS, 0.1, 33.0), 0) == 33.0
 
 
 @pytest.mark.parametrize(("goals", "rate"), [([1.0], 0.0), ([1.0], -1.0), ([np.nan], 1.0), ([np.inf], 1.0)])
@@ -138,7 +138,7 @@ def reset(limits: Limits, model: StageModel, swaps_to: StageModel | None = None,
         if swaps_to and k == 10:
             made.use_model(swaps_to)
     assert made.mode is OperatingMode.STREAMING or steps < 10**6
-    made.hold(steps * 10**7)
+    made.stop(StopReason.DEACTIVATED, steps * 10**7)
     return made
 
 

@@ -51,7 +51,7 @@ def move(made, k, *names):
 
 def with_effects(*effects, limits=LIMITS, settings=OFF):
     model = replace(X, effects=effects)
-    axis = Axis("x", 0, limits, settings)
+    axis = Axis("x", limits, settings)
     axis.use(model, axis.prepare(model))
     return axis
 
@@ -111,7 +111,7 @@ def test_a_path_reckons_with_axes_that_another_path_brings_elsewhere():
     follow(made, {"y": PATHS["y"][300:]}, start_ns=START + 300 * MS)
     given = give(made)
     # A pause of y before its path; a jump of x in both.
-    twin.axes[1].stamps.accept(START)
+    twin.axes[1].samples.stamps.accept(START)
     expected = np.array([move(twin, k, "x" if k < 300 else "y") for k in range(600)])
     np.testing.assert_allclose(given[:300], expected[:300], rtol=0, atol=1e-9)
     # The end of the path of x is followed by a hold, from three intervals on, at least 20 ms.
@@ -210,8 +210,8 @@ def test_health_knows_the_effects():
     for k, y in enumerate(PATHS["x"].tolist()):
         v = axis.update(DT if k else 0.0, y, 0)
         axis.measure(stage.drive(v, DT if k else 0.0), 0)
-    assert axis.drift.samples == 500
-    assert axis.drift.rms < 1e-12
+    assert axis.loop.drift.samples == 500
+    assert axis.loop.drift.rms < 1e-12
 
 
 def test_feedback_with_effects():
@@ -222,9 +222,10 @@ def test_feedback_with_effects():
         axis = with_effects(LAG, CREEP, settings=each)
         stage = axis.model.stream()
         for k, y in enumerate(np.append(PATHS["x"], np.full(1500, PATHS["x"][-1])).tolist()):
-            v = axis.update(DT if k else 0.0, y, 0)
+            now_ns = round(k * DT * 1e9)
+            v = axis.update(DT if k else 0.0, y, now_ns)
             measured = stage.drive(v + 2.0, DT if k else 0.0)
-            axis.measure(measured, 0)
+            axis.measure(measured, now_ns)
             errors[each.enabled] = abs(measured - y)
     assert errors[True] < 0.05 * errors[False]
 

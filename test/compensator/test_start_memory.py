@@ -40,7 +40,7 @@ def test_the_memory_asked_for_is_where_it_starts(name):
     made = controller(name)
     assert memory_of(made).snapshot() == MEMORIES[name].snapshot()
     assert made.voltages[0] == MEMORIES[name].voltage
-    assert made.axes[0].start_memory == name and made.axes[0].confidence.state == ASSUMED
+    assert made.axes[0].initial.assumed == name and made.axes[0].confidence.state == ASSUMED
 
 
 def test_the_memories_of_this_model_are_told_apart_by_their_displacement():
@@ -66,7 +66,7 @@ def test_first_measurements_choose_among_histories_and_never_the_voltage(assumed
     best = min(START_MEMORIES, key=lambda name: abs(there[name] - there[true]))
     assert memory_of(made).displacement == pytest.approx(there[best], abs=1e-12)
     assert made.voltages[0] == made.axes[0].voltage == present
-    assert not made.axes[0].confidence.contradicted and made.axes[0].start_memory is None
+    assert not made.axes[0].confidence.contradicted and made.axes[0].initial.assumed is None
     # Later ones do not: the stage moves.
     before = memory_of(made).snapshot()
     told(made, there[assumed], since_ns=100 * MS)
@@ -96,7 +96,7 @@ def test_measurements_that_do_not_agree_or_are_not_fresh_choose_nothing(what, re
     made.locate(START_NS + 10 * MS)
     assert memory_of(made).snapshot() == MEMORIES["end"].snapshot()
     assert made.voltages[0] == MEMORIES["end"].voltage
-    assert made.axes[0].start_memory == "end" and not made.axes[0].confidence.contradicted
+    assert made.axes[0].initial.assumed == "end" and not made.axes[0].confidence.contradicted
 
 
 def test_measurements_that_fit_none_are_told_and_change_nothing():

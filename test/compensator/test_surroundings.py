@@ -57,9 +57,9 @@ def test_the_voltage_follows_a_value_and_keeps_it_over_a_new_model(loops):
         return float(controller.voltages[0])
 
     before = voltage(SECOND)
-    assert controller.surround(KEY, 23.0, SECOND)
-    assert not controller.surround("/other", 1.0, SECOND)
-    assert not controller.surround(KEY, 99.0, SECOND)
+    assert controller.surroundings.take(KEY, 23.0, SECOND)
+    assert not controller.surroundings.take("/other", 1.0, SECOND)
+    assert not controller.surroundings.take(KEY, 99.0, SECOND)
     warm = voltage(2 * SECOND)
     # 2 K expand it by 0.8 um.
     assert warm < before - 1.0

@@ -79,7 +79,7 @@ def test_a_voltage_outside_goes_inside_at_the_slew_limit(present):
 @pytest.mark.parametrize(("present", "taken"), [(119.0, True), (121.0, False), (-19.0, True), (-21.0, False)])
 def test_a_running_axis_takes_no_model_that_would_extrapolate_far(present, taken):
     wide = replace(AXIS, voltage_range=(-500.0, 500.0))
-    axis = Axis("x", 0, Limits(-500.0, 500.0, 100.0), OPEN_LOOP)
+    axis = Axis("x", Limits(-500.0, 500.0, 100.0), OPEN_LOOP)
     axis.use(wide, axis.prepare(wide, (0.0, present)))
     if taken:
         axis.use(AXIS, axis.prepare(AXIS))
@@ -95,7 +95,7 @@ def test_a_sample_that_the_slew_limit_holds_back_is_reached_with_a_new_model(eff
     stiff = replace(AXIS, effects=effects)
     own = AXIS.hysteresis
     soft = replace(stiff, hysteresis=replace(own, everett=0.8 * own.everett, rise=0.8 * own.rise))
-    axis = Axis("x", 0, limits, OPEN_LOOP)
+    axis = Axis("x", limits, OPEN_LOOP)
     axis.use(stiff, axis.prepare(stiff))
     now = 1_000_000_000
     desired = AXIS.displacement_range[0] + 0.7 * float(np.ptp(AXIS.displacement_range))

@@ -10,7 +10,7 @@ from strategies import FAMILY_CASE, PI_CASE, axis_model, fractions
 
 from slpi_ros.compensator import validation as rejection
 from slpi_ros.compensator.axis import Axis
-from slpi_ros.compensator.controller import OPEN_LOOP, Controller, OperatingMode
+from slpi_ros.compensator.controller import OPEN_LOOP, Controller, OperatingMode, StopReason
 from slpi_ros.compensator.trajectory import Trajectory, TrajectoryExecutor
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import SlpiError
@@ -134,7 +134,7 @@ def controller(names="xy", stage=STAGE, **limits):
 
 
 def twin(**limits):
-    axis = Axis("x", 0, Limits(0.0, 100.0, **limits), OPEN_LOOP)
+    axis = Axis("x", Limits(0.0, 100.0, **limits), OPEN_LOOP)
     axis.use(MODEL, axis.prepare(MODEL))
     return axis
 
@@ -263,7 +263,7 @@ def test_replaced_at_once_appended_later_and_stopped():
     follow(made, START + 100 * MS, since_ns=now)
     assert made.voltages[0] == before and made.voltages[1] > 0.0
     assert made.trajectory.next_deadline_ns == made.next_due_ns(now, now) == START + 100 * MS
-    made.cancel(START + 100 * MS)
+    made.stop(StopReason.CANCELED, START + 100 * MS)
     assert made.next_due_ns(now, now) is None and not made.advance(START + 10**12, START + 10**12)
 
 
@@ -300,13 +300,16 @@ def test_a_trajectory_that_is_too_fast_is_told_before_it_begins():
     for made, step in ((quick, 400 * MS), (slow, 700 * MS)):
         made.follow(["x"], np.arange(1, 4) * step, y[:, None], 0, START, START)
         assert not made.trajectory.begun and made.voltages[0] == 0.0
-    assert slow.too_fast == ""
+    assert slow.trajectory.too_fast == ""
     # 60 V in 0.4 s at 100 V/s.
-    assert "'x', point 1 at 0.8 s will be late by 0.2 s" in quick.too_fast and "\n" not in quick.too_fast
+    assert (
+        "'x', point 1 at 0.8 s will be late by 0.2 s" in quick.trajectory.too_fast
+        and "\n" not in quick.trajectory.too_fast
+    )
     # It is about the limits, not about the clock: with none there is nothing to say.
     free = controller()
     free.follow(["x"], np.arange(1, 4) * MS, y[:, None], 0, START, START)
-    assert free.too_fast == ""
+    assert free.trajectory.too_fast == ""
 
 
 def test_what_a_trajectory_that_is_too_fast_has_not_reached_follows_after_it():

@@ -110,6 +110,16 @@ def test_the_page_of_parameters_has_those_of_every_node():
     assert len(programs) >= 8 and re.findall(r"^## (\w+)$", said, re.MULTILINE) == sorted(programs)
 
 
+def test_the_page_of_motions_has_the_table_of_the_code():
+    assert "\n<!-- generated: motions -->\n" in (DOCS / "reference" / "motions.md").read_text()
+    command = [sys.executable, "-c", "import generated; print(generated.motions())"]
+    said = subprocess.run(
+        command, cwd=DOCS, stdout=subprocess.PIPE, text=True, check=True, env=os.environ | PATHS
+    ).stdout
+    rows = {row.split("|")[1].strip(): row.split("|")[3].strip() for row in said.splitlines()[2:]}
+    assert rows["`block`"] == "`idle`, `fault`" and rows["`fault`"] == "`idle`" and rows["`hold`"] == "any"
+
+
 def test_the_diagnosis_page_has_the_table_of_all_effects():
     assert "\n<!-- generated: effects -->\n" in (DOCS / "explanation" / "diagnosis.md").read_text()
 

@@ -1,5 +1,6 @@
 """Measured displacements over DDS: they correct the voltage when told to, and tell when the model no longer holds."""
 
+import time
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -33,16 +34,23 @@ class DriftedStage:
     def __init__(self, client: Client, offset: float) -> None:
         self._client, self._offset = client, offset
         self._memory = stage_model().axis("x").memory()
+        self._followed = 0
         self.publisher = client.graph.publisher(JointState, "/measured_displacement", qos_profile_sensor_data)
         self._sent = 0
 
     def follow(self, wishes: list[float]) -> np.ndarray:
-        """Return the errors (m) of a path, each sample measured before the next is sent."""
-        errors = []
-        for y in wishes:
-            (voltage,) = self._client.ask(["x"], [y], START_NS + self._sent * PERIOD_NS)
+        """Return the errors (m) of a path in real time, each sample measured before the next is sent."""
+        errors, begun = [], time.monotonic()
+        for k, y in enumerate(wishes):
+            self._client.ask(["x"], [y], START_NS + self._sent * PERIOD_NS)
             self._sent += 1
-            place = self._memory.forward(voltage + self._offset)
+            # The loop goes by the clock of the node, between the samples as well.
+            end = begun + (k + 1) * PERIOD_NS * 1e-9
+            self._client.graph.spin_until(lambda end=end: time.monotonic() >= end, "the next sample")
+            voltages = self._client.answers
+            for (voltage,) in voltages[self._followed :]:
+                place = self._memory.forward(voltage + self._offset)
+            self._followed = len(voltages)
             self.publisher.publish(JointState(name=["other", "x"], position=[1.0, place]))
             errors.append(place - y)
         return np.array(errors)

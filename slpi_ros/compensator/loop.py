@@ -1,0 +1,270 @@
+"""Sensor and feedback of one axis: readings correct its voltage, and are held against its model."""
+
+from collections import deque
+from math import isfinite
+from statistics import median
+
+from slpi_ros.compensator.feedback import Drift, Feedback, LoopSettings, ResidualWindow
+from slpi_ros.compensator.model_swap import continue_from
+from slpi_ros.compensator.sensor_watch import Fault, SensorWatch
+from slpi_ros.compensator.statistics import TrackingStatistics
+from slpi_ros.errors import SlpiError
+from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.model.axis_model import AxisModel
+from slpi_ros.model.limits import MAX_DT, Limits, RateLimiter
+from slpi_ros.model.sensor import Sensed, StreamingSensor
+from slpi_ros.model.streaming import StreamingInverse
+
+# Most measurements for the offset of an axis, and how old they may be.
+OFFSETS, OFFSET_AGE_NS = 50, SECOND_NS // 5
+
+
+class Loop:
+    """Closed loop of one axis, from its first reading on.
+
+    A second inverse, `applied`, follows the total voltage, so that it tells where the stage is; the inverse of the axis
+    follows the setpoint, so that the noise of the sensor causes no reversals of its memory. The correction is computed
+    once in each period of `output`, on the steady clock: with the first setpoint that is answered in the period, or at
+    its end. So it does not depend on how often setpoints come. Without `settings.enabled` the readings are used for
+    what is reported only. Times: steady clock, ns.
+    """
+
+    _applied: StreamingInverse
+    _residuals: ResidualWindow
+    _sensor: StreamingSensor
+
+    def __init__(self, settings: LoopSettings, output: RateLimiter) -> None:
+        self.settings, self._output = settings, output
+        self.fault: Fault | None = None  # for which the feedback was switched off
+        self.watch = SensorWatch(1.0)
+        self._feedback: Feedback | None = None
+        # Measured - model, with the time (ns), also where the measurement is refused.
+        self._offsets: deque[tuple[int, float]] = deque(maxlen=OFFSETS)
+        # Setpoint and displacement of the model as a sensor with delay or lag reads them; None without these.
+        self._setpoint: Sensed | None = None
+        self._expected: Sensed | None = None
+        self._corrected_ns = 0  # begin of the last period with a correction
+        self.driven_ns, self._between = 0, 0.0  # last step of `applied`; time (s) of its steps without the axis
+
+    # State
+
+    @property
+    def closed(self) -> bool:
+        """Whether the total voltage is followed, because there was a reading."""
+        return self._feedback is not None
+
+    @property
+    def active(self) -> bool:
+        """Whether readings correct the voltage."""
+        return self._feedback is not None and self.settings.enabled
+
+    @property
+    def correction(self) -> float:
+        """Correction contained in the present voltage, volts."""
+        return self._feedback.correction if self._feedback else 0.0
+
+    @property
+    def state(self) -> str:
+        """One of "off", "on", "saturated", "holding" (no recent measurement) or "fault" (of the sensor)."""
+        if not self.settings.enabled:
+            return "off"
+        if self.fault:
+            return "fault"
+        if not (self._feedback and self._feedback.acting):
+            return "holding"
+        return "saturated" if self._feedback.saturated else "on"
+
+    @property
+    def drift(self) -> Drift | None:
+        """Residual (measured - model) statistics; None if there are too few measurements."""
+        return self._residuals.drift() if self._feedback else None
+
+    @property
+    def due_ns(self) -> int:
+        """When the next `tick` is due, steady clock: at the end of the period after that of the last correction."""
+        period_ns = self._period_ns
+        due_ns = self._corrected_ns + 2 * period_ns
+        # A voltage that moves within an acceleration limit goes on in each period.
+        return min(due_ns, self.driven_ns + period_ns) if self._output.in_motion else due_ns
+
+    def applied(self, stream: StreamingInverse) -> StreamingInverse:
+        """Return the inverse that follows the total voltage: that of the axis, `stream`, before the first reading."""
+        return self._applied if self._feedback else stream
+
+    def offset(self, now_ns: int) -> float | None:
+        """Return the present measured - model displacement (m); None without a measurement in the last 0.2 s."""
+        recent = [offset for t, offset in self._offsets if now_ns - t <= OFFSET_AGE_NS]
+        return median(recent) if recent else None
+
+    @property
+    def _period_ns(self) -> int:
+        return max(round(self._output.period * SECOND_NS), 1)
+
+    # Model and settings
+
+    def use(self, model: AxisModel, allowed: Limits, stream: StreamingInverse, now_ns: int) -> None:
+        """Follow another `model` with the inverse `stream` of the axis; the voltage is unchanged."""
+        low, high = model.displacement_range
+        self.watch.span, self.watch.noise = high - low, model.quality.floor_rms
+        self._sensor = model.streaming_sensor()
+        self._setpoint = Sensed(self._sensor, stream.uncoupled_displacement) if self._sensor.late else None
+        if self._feedback:
+            self._applied = continue_from(model, allowed, self._applied)
+            self._forget_residuals()
+        elif self.settings.enabled:
+            self.close(stream, now_ns)
+
+    def retune(self, settings: LoopSettings, stream: StreamingInverse | None, now_ns: int) -> None:
+        """Replace the settings without a voltage step; feedback that was switched off for a fault resumes."""
+        if self.fault:
+            # What the sensor told before does not count any more.
+            self.watch.begin(now_ns)
+        self.settings, self.fault = settings, None
+        feedback = self._feedback
+        if feedback is None:
+            if settings.enabled and stream is not None:
+                self.close(stream, now_ns)
+            return
+        feedback.correction_limit = settings.correction_limit
+        try:
+            feedback.retune(settings.gains)
+        except SlpiError:
+            # The last measurement gives no finite voltage with the new gains.
+            feedback.forget()
+            feedback.retune(settings.gains)
+        if settings.enabled:
+            feedback.enable()
+        else:
+            feedback.disable()
+
+    def close(self, stream: StreamingInverse, now_ns: int) -> None:
+        """Start to follow the total voltage, at present that of the inverse `stream` of the axis."""
+        self._applied = stream.copy()
+        self._residuals = ResidualWindow(self._applied.uncoupled_displacement)
+        self._forget_residuals()
+        self.restart(stream, now_ns)
+
+    def restart(self, stream: StreamingInverse, now_ns: int) -> None:
+        """Restart the feedback at the present voltage and rate, without a correction."""
+        settings, output = self.settings, self._output
+        self._feedback = feedback = Feedback(
+            settings.gains, output.limits, output.voltage, correction_limit=settings.correction_limit
+        )
+        feedback.begin(now_ns)
+        # The feedforward has a rate limiter of its own, beside that of the total voltage.
+        feedback.pace, stream.pace = output, output.copy()
+        self.watch.begin(now_ns)
+        self.driven_ns, self._between = now_ns, 0.0
+        if settings.enabled and not self.fault:
+            feedback.enable()
+
+    def leave(self, stream: StreamingInverse) -> None:
+        """Let the inverse of the axis go on from the total voltage."""
+        if self._feedback:
+            stream.restore(self._applied.snapshot())
+        stream.pace = self._output
+
+    def settle(self, stream: StreamingInverse, now_ns: int) -> None:
+        """Start again after motion without setpoints."""
+        if self._feedback:
+            self.restart(stream, now_ns)
+            self._forget_residuals()
+        if self._setpoint:
+            self._setpoint.restart(stream.uncoupled_displacement + stream.coupled)
+
+    # Readings
+
+    def read(self, y: float, expected: float, now_ns: int, fresh: bool, within: bool) -> float:
+        """Take a reading (m); return the displacement (m) without the sensor's own errors.
+
+        `expected` (m) is where the model is. Only a `fresh` one, stamped now, counts for the zero, and only one
+        `within` the accepted displacements is corrected.
+        """
+        x = self._sensor.correct(y) if within else y
+        sensed = self._expected.span(now_ns) if self._expected and self._feedback else ()
+        if fresh and isfinite(x):
+            self._offsets.append((now_ns, x - (sensed[-1] if sensed else expected)))
+        return x
+
+    def measure(self, x: float, expected: float, now_ns: int, watched: bool, tracking: TrackingStatistics) -> None:
+        """Compare a displacement (m) from `read` with model and setpoint; `watched`: a fault of the sensor counts."""
+        assert self._feedback
+        sensed = self._expected.span(now_ns) if self._expected else ()
+        for each in sensed:
+            self._residuals.expect(each)
+        if sensed or not self._expected:
+            self._residuals.measure(x)
+        if watched:
+            self.watch.read(sensed[-1] if sensed else expected, x, now_ns)
+        desired = self._setpoint.at(now_ns) if self._setpoint else None
+        if desired is not None or not self._setpoint:
+            if not self.fault:
+                self._feedback.measure(x, now_ns, desired)
+            tracking.measure(x, desired)
+
+    def faulty(self, fault_time: float, now_ns: int) -> Fault | None:
+        """Switch the feedback off if its sensor has been faulty for `fault_time` (s; 0: never); return a new fault."""
+        if not (self.active and fault_time) or self.fault:
+            return None
+        self.fault = self.watch.judge(now_ns, fault_time)
+        if self.fault:
+            assert self._feedback
+            self._feedback.disable()
+        return self.fault
+
+    def forget_offsets(self) -> None:
+        """Forget the offsets: the zero has moved."""
+        self._offsets.clear()
+
+    # Voltages
+
+    def correct(self, dt: float, y: float, v: float, coupled: float, now_ns: int) -> float:
+        """Return the total voltage (V) for a setpoint `y` (m) with feedforward `v` (V), `dt` (s) after the last one."""
+        dt, self._between = max(dt - self._between, 0.0), 0.0
+        return self._output_with(dt, y, v, coupled, now_ns)
+
+    def tick(self, y: float, v: float, coupled: float, now_ns: int) -> float:
+        """Return the total voltage (V) at the end of a period, with the same setpoint (m) and feedforward (V)."""
+        dt = max((now_ns - self.driven_ns) * 1e-9, 0.0)
+        self._between += dt
+        # The correction is that of the period that has ended.
+        return self._output_with(dt, y, v, coupled, now_ns, self._period_ns)
+
+    def _output_with(self, dt: float, y: float, v: float, coupled: float, now_ns: int, early_ns: int = 0) -> float:
+        feedback, applied = self._feedback, self._applied
+        assert feedback
+        period_ns = self._period_ns
+        begin_ns = (now_ns - early_ns) // period_ns * period_ns
+        first, self._corrected_ns = begin_ns > self._corrected_ns, max(begin_ns, self._corrected_ns)
+        applied.coupled = coupled
+        if dt > MAX_DT:
+            applied.wait(dt - MAX_DT)
+            dt = MAX_DT
+        v = feedback.step(y, v, now_ns, self.settings.timeout if first else None)
+        self.driven_ns = now_ns
+        self._expect(applied.drive(v, dt), now_ns)
+        return v
+
+    def follow(self, voltage: float, dt: float, now_ns: int) -> None:
+        """Follow a voltage (V) without setpoint, `dt` (s) after the last one."""
+        if self._feedback:
+            self.driven_ns, self._between = now_ns, 0.0
+            self._expect(self._applied.drive(voltage, dt), now_ns)
+
+    def setpoint(self, y: float, now_ns: int) -> None:
+        """Take a setpoint (m) that has been output."""
+        if self._setpoint:
+            self._setpoint.hold(y, now_ns)
+
+    def _expect(self, displacement: float, now_ns: int) -> None:
+        """Set the displacement of the model (m) with which readings are compared from `now_ns` (ns) on."""
+        if self._expected:
+            self._expected.hold(displacement, now_ns)
+        else:
+            self._residuals.expect(displacement)
+
+    def _forget_residuals(self) -> None:
+        """Discard the residuals, as the model or the state of its hysteresis has changed."""
+        displacement = self._applied.uncoupled_displacement
+        self._residuals.forget(displacement)
+        self._expected = Sensed(self._sensor, displacement + self._applied.coupled) if self._sensor.late else None

@@ -22,6 +22,7 @@ from slpi_ros.io.outputs import allow_document
 from slpi_ros.model.document import parse_model, save_model
 from slpi_ros.model.sensor import LONGEST
 from slpi_ros.model.stage_model import StageModel
+from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.common import ERROR, LATCHED, WARN, DeferredService, Diagnostics, Health
 from slpi_ros.nodes.jobs import (
     DiagnosisOutcome,
@@ -33,58 +34,55 @@ from slpi_ros.nodes.jobs import (
     fit,
     run_diagnosis,
 )
-from slpi_ros.nodes.parameters import Declaration, Parameters, Values, number, validated
+from slpi_ros.nodes.parameters import Declaration, Parameters, Values, validated
 
+ANY_TIME = (-math.inf, math.inf)
 DECLARATIONS = (
     Declaration(
         "bags", [""],
         "Bags to identify in one fit: rosbag2 folders, or single mcap or db3 files. A later change of a parameter "
         "repeats the identification.",
     ),
-    Declaration(
+    declare.text(
         "watch_directory", "",
         "Watched folder: the newest complete bag and every bag completed later are identified, unless recorded on "
         "another stage than the published model; empty: none.",
     ),
-    Declaration("topic", "stage_state", "Topic of the bag that holds voltage and displacement."),
+    declare.text("topic", "stage_state", "Topic of the bag that holds voltage and displacement."),
     Declaration(
         "surroundings", [""],
         "Recorded quantities that the stage may follow, topic or topic:field: the model compensates those that it "
         "follows; empty: none, and for ~/diagnose every one that the bag holds.",
     ),
-    Declaration("kind", "slpi", f"Kind of hysteresis model: {', '.join(KINDS)}.", choices=tuple(KINDS)),
-    Declaration("output", "", "File for the model document; empty: none."),
+    declare.text("kind", "slpi", f"Kind of hysteresis model: {', '.join(KINDS)}.", *KINDS),
+    declare.text("output", "", "File for the model document; empty: none."),
     Declaration(
         "replace", False,
         "Whether a new model is published whatever it lacks beside the model in use: voltage range, coverage, samples, "
         "held-out error.",
     ),
-    Declaration(
+    declare.scalar(
         "sensor_delay", 0.0, "Known delay of the sensor, seconds, taken out of its readings; the model keeps it.",
-        between=(0.0, LONGEST), number=True,
+        (0.0, LONGEST),
     ),
-    Declaration(
+    declare.scalar(
         "sensor_lag", 0.0,
         "Known time constant of the sensor's low-pass filter, seconds, taken out of its readings; the model keeps it.",
-        between=(0.0, LONGEST), number=True,
+        (0.0, LONGEST),
     ),
-    Declaration(
+    declare.scalar(
         "start", math.nan, "Start of the fitted part, seconds from the first stamp; NaN or negative: first stamp.",
-        number=True,
+        ANY_TIME,
     ),
-    Declaration(
-        "stop", math.nan, "End of the fitted part, seconds from the first stamp; NaN or negative: last stamp.",
-        number=True,
+    declare.scalar(
+        "stop", math.nan, "End of the fitted part, seconds from the first stamp; NaN or negative: last stamp.", ANY_TIME
     ),
-    Declaration(
+    declare.text(
         "diagnosis_directory", "",
         "Output folder of ~/diagnose; empty: NAME_diagnosis next to the output NAME.json, or, without an output, a "
         "temporary folder named in the service response.",
     ),
-    Declaration(
-        "diagnostic_period", 1.0, "Period of /diagnostics, seconds.",
-        read_only=True, between=(0.05, 3600.0), number=True,
-    ),
+    declare.DIAGNOSTIC_PERIOD,
 )  # fmt: skip
 
 
@@ -104,7 +102,7 @@ class IdentifySettings:
         if not values["topic"]:
             raise UsageError("parameter topic is empty; name the topic of the bag, as in stage_state")
         checked = validated(DECLARATIONS, values)
-        start, stop = bound(values, "start"), bound(values, "stop")
+        start, stop = (None if (time := checked[name]) is None or time < 0.0 else time for name in ("start", "stop"))
         if start is not None and stop is not None and not start < stop:
             raise UsageError(f"parameter start is {start:g} s and stop {stop:g} s; start before you stop")
         request = FitRequest(
@@ -129,15 +127,6 @@ class IdentifySettings:
 def beside(output: str) -> str:
     """Return the diagnosis folder next to the model file `output`; "" without a file."""
     return f"{os.path.splitext(output)[0]}_diagnosis" if output else ""
-
-
-def bound(values: Values, name: str) -> float | None:
-    """Return the parameter `name` as a time of the record, seconds; None if NaN or negative."""
-    given = values[name]
-    if isinstance(given, float) and math.isnan(given):
-        return None
-    seconds = number(values, name, -math.inf, math.inf)
-    return seconds if seconds >= 0 else None
 
 
 POLL_PERIOD = 0.1

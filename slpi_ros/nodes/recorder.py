@@ -11,6 +11,7 @@ from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.bag_writer import STORAGES, BagWriter
 from slpi_ros.io.messages import JOINT_STATE
+from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.common import message_class, request_stop
 from slpi_ros.nodes.parameters import Declaration, Parameters, validated
 
@@ -20,14 +21,14 @@ DISCOVERY_PERIOD = 0.1
 # Discovery of publishers may take several seconds.
 PATIENCE = 5.0
 STAGE_STATE = "stage_state"
-DECLARATIONS = (
-    Declaration("output", "", "rosbag2 folder to create; required.", read_only=True),
-    Declaration("topics", [STAGE_STATE], "Topics to record.", read_only=True),
-    Declaration("storage", "mcap", "File format: mcap or sqlite3.", read_only=True, choices=tuple(STORAGES)),
-    Declaration(
+DECLARATIONS = declare.read_only(
+    declare.text("output", "", "rosbag2 folder to create; required."),
+    Declaration("topics", [STAGE_STATE], "Topics to record."),
+    declare.text("storage", "mcap", "File format: mcap or sqlite3.", *STORAGES),
+    declare.scalar(
         "duration", 0.0,
         "Seconds from the first message; without any message the node stops 5 s after this time. 0: until a signal.",
-        read_only=True, between=(0.0, 1e9), number=True,
+        (0.0, 1e9),
     ),
 )  # fmt: skip
 

@@ -18,6 +18,7 @@ from std_msgs.msg import Float64, Float64MultiArray
 
 from slpi_ros.errors import UsageError
 from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.common import COMMANDS
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, validated
 from slpi_ros.simulation.character import Character
@@ -29,70 +30,55 @@ LOG_PERIOD = 5.0
 QUIET = 0.3
 # Seconds; creep has decayed after this time.
 DAY = 86_400.0
-VOLTAGE = (-10_000.0, 10_000.0)
 # Noise of the sensors in the room, kelvin and newton; readings of the load for each of the temperature.
 NOISE_OF_TEMPERATURE, NOISE_OF_LOAD, LOADS = 0.01, 0.01, 10
 GIVEN, DRAWN, HIDDEN = "given", "drawn", "hidden"
-DECLARATIONS = (
-    Declaration("axes", ["x"], "Names of the axes, in the order of voltage_command.", read_only=True),
-    Declaration(
+DECLARATIONS = declare.read_only(
+    declare.AXES,
+    declare.text(
         "hardware_id", "",
         "Identifier of the stage in stage_state; empty: simulated-PRESET, or simulated-SEED without a preset, and what "
         "identifies the character, if any.",
-        read_only=True,
     ),
-    Declaration("preset", "", "p11: the stage of the MPI paper; empty: a random one.", read_only=True),
-    Declaration("seed", 0, "Seed of the random stage and of the noise.", read_only=True, between=(0, 2**53)),
-    Declaration(
-        "noise_rms", 8e-9, "Sensor noise without a preset, metres rms.", read_only=True, between=(0.0, 1.0), number=True
-    ),
-    Declaration(
-        "voltage_min", 0.0, "Lower limit of the amplifier, volts.", read_only=True, between=VOLTAGE, number=True
-    ),
-    Declaration(
-        "voltage_max", 100.0, "Upper limit of the amplifier, volts.", read_only=True, between=VOLTAGE, number=True
-    ),
+    declare.text("preset", "", "p11: the stage of the MPI paper; empty: a random one."),
+    declare.SEED,
+    declare.scalar("noise_rms", 8e-9, "Sensor noise without a preset, metres rms.", (0.0, 1.0)),
+    declare.scalar("voltage_min", 0.0, "Lower limit of the amplifier, volts.", declare.VOLTAGE),
+    declare.scalar("voltage_max", 100.0, "Upper limit of the amplifier, volts.", declare.VOLTAGE),
     Declaration(
         "initial_state", [0.0],
         "Voltages applied to all axes one day before the start, followed by 0 V, to reproduce an earlier state.",
-        read_only=True, number=True,
+        number=True,
     ),
     Declaration(
-        "answer_commands", True, "Whether to publish one state for each command; else `rate` states per second.",
-        read_only=True,
+        "answer_commands", True, "Whether to publish one state for each command; else `rate` states per second."
     ),
-    Declaration(
-        "rate", 200.0, "States per second without answer_commands, and while no commands come, hertz.",
-        read_only=True, between=(1e-3, 1e4), number=True,
+    declare.scalar(
+        "rate", 200.0, "States per second without answer_commands, and while no commands come, hertz.", (1e-3, 1e4)
     ),
-    Declaration(
+    declare.scalar(
         "speed", 1.0,
         "Stage seconds per second. Other than 1: the node publishes /clock at `rate`, for nodes with use_sim_time.",
-        read_only=True, between=(0.01, 1000.0), number=True,
+        (0.01, 1000.0),
     ),
-    Declaration(
+    declare.text(
         "character", GIVEN,
         "given: the effects named below. drawn: one or two effects per axis, drawn from the seed and logged. hidden: "
         "the same, but not told.",
-        read_only=True, choices=(GIVEN, DRAWN, HIDDEN),
+        GIVEN, DRAWN, HIDDEN,
     ),
-    Declaration(
+    declare.scalar(
         "room_swing", 0.0,
         "Rms of the temperature of the room about 21 °C, kelvin; more than 0: it is published, as is the load.",
-        read_only=True, between=(0.0, 50.0), number=True,
+        (0.0, 50.0),
     ),
-    Declaration(
-        "room_load", 2.0, "Largest load of the stage, newton; it comes and goes.",
-        read_only=True, between=(0.0, 1e4), number=True,
-    ),
-    Declaration(
-        "room_rate", 2.0, "Readings of the temperature per second, hertz; of the load ten times as many.",
-        read_only=True, between=(1e-3, 100.0), number=True,
+    declare.scalar("room_load", 2.0, "Largest load of the stage, newton; it comes and goes.", (0.0, 1e4)),
+    declare.scalar(
+        "room_rate", 2.0, "Readings of the temperature per second, hertz; of the load ten times as many.", (1e-3, 100.0)
     ),
     *(
-        Declaration(
-            figure.name, figure.default, figure.metadata["meaning"] + " One value, or one for each axis.",
-            read_only=True, between=figure.metadata["between"], number=True, each_axis=True,
+        declare.each_axis(
+            figure.name, getattr(Character(), figure.name), figure.metadata["meaning"], figure.metadata["between"]
         )
         for figure in fields(Character)
     ),

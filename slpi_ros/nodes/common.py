@@ -15,6 +15,7 @@ from typing import Any, Protocol, runtime_checkable
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lifecycle_msgs.srv import ChangeState
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -23,6 +24,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
+from rclpy.timer import Timer
 from rclpy.utilities import ok, try_shutdown
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -101,6 +103,22 @@ def _refusing(node: LifecycleNode, change_state: Any) -> Any:
     return on_request
 
 
+def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
+    """Create a timer with a `period` (s) of a clock that neither stops, as a simulated one may, nor is set back."""
+    return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+def reliability_of(publishers: Sequence[Any]) -> ReliabilityPolicy:
+    """Return the reliability that all publishers of a topic offer."""
+    reliable = all(each.qos_profile.reliability == ReliabilityPolicy.RELIABLE for each in publishers)
+    return ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+
+
+def full_name(namespace: str, name: str) -> str:
+    """Return the full name of a node."""
+    return f"{namespace.rstrip('/')}/{name}"
+
+
 def message_class(topic: str, msgtype: str) -> Any:
     """Return the class of a message type; RecordError, which names the topic, if it is not installed."""
     package, kind, name = msgtype.split("/")
@@ -118,7 +136,7 @@ def publishers_beside(node: Node, topic: str) -> list[str]:
     names = [(each.node_name, each.node_namespace) for each in node.get_publishers_info_by_topic(topic)]
     if own in names:
         names.remove(own)
-    return sorted(f"{namespace.rstrip('/')}/{name}" for name, namespace in names)
+    return sorted(full_name(namespace, name) for name, namespace in names)
 
 
 def ask_for_priority(node: Node, priority: int) -> None:

@@ -255,25 +255,25 @@ def _starts(values: Mapping[str, Any]) -> tuple[str | float, ...]:
     given, axes = values["start_voltage"], values["axes"]
     words = [each.strip() for each in given.split(",")]
     words *= len(axes) if len(words) == 1 else 1
-    starts: list[str | float] = []
-    for word in words:
-        if word not in STARTS:
-            try:
-                starts.append(float(word))
-            except ValueError:
-                starts.append(nan)
-        else:
-            starts.append(word)
+    starts = [_start(word) for word in words]
     limits = zip(values["voltage_min"], values["voltage_max"], strict=True)
-    within = [
-        not isinstance(each, float) or low <= each <= high for each, (low, high) in zip(starts, limits, strict=False)
-    ]
+    within = [isinstance(each, str) or low <= each <= high for each, (low, high) in zip(starts, limits, strict=False)]
     if len(starts) != len(axes) or not all(within):
         raise UsageError(
             f"parameter start_voltage is {given!r}; give {', '.join(STARTS)} or a voltage within the limits, or one of "
             f"these for each of the axes {', '.join(axes)}, separated by commas"
         )
     return tuple(starts)
+
+
+def _start(word: str) -> str | float:
+    """Return a word of `STARTS`, or the voltage (V) that it names; NaN if it is neither."""
+    if word in STARTS:
+        return word
+    try:
+        return float(word)
+    except ValueError:
+        return nan
 
 
 def _reset_spans(values: Mapping[str, Any], limits: tuple[Limits, ...]) -> tuple[tuple[float, float], ...]:

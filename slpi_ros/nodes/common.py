@@ -3,11 +3,9 @@
 import ctypes
 import importlib
 import os
-import signal
 import sys
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -32,7 +30,7 @@ from std_srvs.srv import Trigger
 from slpi_ros.errors import RecordError, SlpiError, UsageError, shown
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.nodes import stop
-from slpi_ros.nodes.stop import SIGNALS, Stop
+from slpi_ros.nodes.stop import Stop
 
 COMMANDS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 # Late subscribers receive the last message.
@@ -260,19 +258,18 @@ def run(make_node: Callable[[], Node], *, executor: str = "events") -> int:
     # The ROS context stays valid until the node's ``destroy_node`` has returned, so that the node may still publish in
     # that method. A node with an attribute `executor_kind` chooses its executor itself.
     global _stop
-    _stop = stop.of_process or Stop()
-    with _signals_to(_stop.on_signal):
-        try:
-            # A signal may have arrived during the imports.
-            if not _stop.requested:
-                _live(make_node, executor)
-        except (KeyboardInterrupt, ExternalShutdownException):
-            return 0
-        except SlpiError as error:
-            print(error, file=sys.stderr, flush=True)
-            return error.exit_code
-        finally:
-            try_shutdown()
+    _stop = stop.of_process or stop.listening()
+    try:
+        # A signal may have arrived during the imports.
+        if not _stop.requested:
+            _live(make_node, executor)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    except SlpiError as error:
+        print(error, file=sys.stderr, flush=True)
+        return error.exit_code
+    finally:
+        try_shutdown()
     return 0
 
 
@@ -306,16 +303,3 @@ def _live(make_node: Callable[[], Node], kind: str) -> None:
             request_stop(error)
     if _stop.failure is not None:
         raise _stop.failure
-
-
-@contextmanager
-def _signals_to(handler: Callable[..., None]) -> Iterator[None]:
-    """Install a handler for SIGINT and SIGTERM for the duration of the ``with`` block."""
-    # Python allows signal handlers in the main thread only; in other threads none is set.
-    numbers = SIGNALS if threading.current_thread() is threading.main_thread() else ()
-    previous = {number: signal.signal(number, handler) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, old in previous.items():
-            signal.signal(number, old)

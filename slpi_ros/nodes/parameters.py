@@ -138,7 +138,8 @@ def limits_of(values: Values) -> tuple[Limits, ...]:
     for name, low, high in zip(values["axes"], lows, highs, strict=True):
         if not low < high:
             raise UsageError(
-                f"axis '{name}': voltage_min {low:g} V is not below voltage_max {high:g} V; correct one of the two"
+                f"axis '{name}': voltage_min {low:g} and voltage_max {high:g} V: the first is not below the second; "
+                "correct one of the two"
             )
     slews = slew_limits(values["slew_limit"], lows, highs)
     accelerations = values.get("acceleration_limit", [0.0] * len(lows))

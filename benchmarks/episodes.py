@@ -312,7 +312,13 @@ class Episode:
                     moves = axis.output._changed_ns == self.now_ns
                     wire.begin(voltage, axis.output.rate if moves else 0.0, self.now_ns if moves else -SECOND_NS)
                     continue
-            wire.output(voltage, self.now_ns, self.ratios, self.what, self.now_ns in (axis.samples.given_ns, axis.loop.driven_ns))
+            wire.output(
+                voltage,
+                self.now_ns,
+                self.ratios,
+                self.what,
+                self.now_ns in (axis.samples.given_ns, axis.loop.driven_ns),
+            )
         self.voltages = {name: wire.voltage for name, wire in zip(AXES, self.wires, strict=True)}
 
     def send(self, names: tuple[str, ...], shares: list[float], clock: int = 0) -> None:

@@ -25,6 +25,7 @@ import numpy as np
 
 from slpi_ros.compensator.controller import Controller
 from slpi_ros.compensator.persistence import MemoryFile, SavedAxis, load_memory, model_id
+from slpi_ros.compensator.statistics import COUNTED
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import SlpiError
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
@@ -121,9 +122,9 @@ class Twin:
     def counters(self) -> dict[str, str]:
         """Counters that the node must report."""
         counts = self.controller.counts
-        causes = {f"rejected.{cause}": count for cause, count in counts.by_cause.items()}
+        causes = {name: counts[name] for name in COUNTED if name.startswith("rejected.")}
         kept = ("received", "accepted", "rejected", "held_at_limit", "slew_limited", "gaps", "time_jumps")
-        return {key: str(value) for key, value in ({name: getattr(counts, name) for name in kept} | causes).items()}
+        return {key: str(value) for key, value in ({name: counts[name] for name in kept} | causes).items()}
 
     @property
     def memory(self) -> dict[str, tuple[float, ...]]:
@@ -360,13 +361,13 @@ class Life:
         order = self.rng.choice(((0, 1, 2, 3, 4, 5), (1, 3, 5, 0, 2, 4), (0, 2, 4, 1, 3, 5)))
         for k in order:
             senders[k % 2](wish(*messages[k]))
-        received = self.twin.controller.counts.received + len(messages)
+        received = self.twin.controller.counts["received"] + len(messages)
         _, values = self.client.report(received=received)
         accepted = int(values["accepted"])
         self.client.graph.spin_until(lambda: len(self.answers) >= accepted, f"{accepted} answers")
         found = merged(self.twin, messages[::2], messages[1::2], self.answers)
         assert found, "no order of the two senders' messages explains the answers"
-        refused = found.controller.counts.rejected - self.twin.controller.counts.rejected
+        refused = found.controller.counts["rejected"] - self.twin.controller.counts["rejected"]
         self.twin = found
         self.note("second publishers of desired_displacement", refused)
 

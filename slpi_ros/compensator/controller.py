@@ -227,7 +227,8 @@ class Controller:
     def set_zero(self, now_ns: int) -> dict[str, float | None]:
         """Let the models agree with the sensors now; return by how much (m) each zero moves, None: not measured."""
         # Whenever a new trajectory may begin.
-        self._begin_output(Kind.TRAJECTORY, now_ns)
+        self._require(Kind.TRAJECTORY, now_ns)
+        self.ownership.begin_output(now_ns)
         assert self.model
         moved = {axis.name: axis.loop.offset(now_ns) for axis in self.axes}
         known = {name: offset for name, offset in moved.items() if offset is not None}
@@ -292,21 +293,18 @@ class Controller:
         return why
 
     def _require(self, kind: Kind, now_ns: int) -> None:
-        """Reject a motion that may not replace the present ones, or any while inactive or without a model."""
+        """Reject a motion that may not replace the present ones, or any while inactive or without a model.
+
+        It begins after `Ownership.begin_output`, which rejects it until the amplifiers are known to be where they are.
+        """
         if not self.active:
             raise RejectedError(rejection.INACTIVE, "the compensator is not active; activate it")
         if self.model is None:
             raise RejectedError(rejection.NO_MODEL, "there is no model yet; give model_file, or publish stage_model")
         for present in [axis.motion.kind for axis in self.axes] + [Kind.TRAJECTORY] * self.trajectory.on:
-            # What the ownership rejects is told with its reason.
             if kind not in REPLACED_BY[present] and present in REFUSALS:
                 cause, advice = REFUSALS[present]
                 raise RejectedError(cause, f"{self.activity(now_ns)}; {advice}")
-
-    def _begin_output(self, kind: Kind, now_ns: int) -> None:
-        """Require that a motion may begin, and from where the amplifiers are; RejectedError with the reason if not."""
-        self._require(kind, now_ns)
-        self.ownership.begin_output(now_ns)
 
     # Desired and measured displacements
 
@@ -315,22 +313,21 @@ class Controller:
     ) -> bool:
         """Move the named axes to their displacements (m), or none; return whether one is held at a voltage limit."""
         # `arrival_ns`, on the clock of the stamps, is used instead of a `stamp_ns` of 0, or if `needs_arrival`.
-        counts = self.counts
-        counts.received += 1
+        self.counts["received"] += 1
         try:
             self._require(Kind.STREAM, now_ns)
             axes = self.messages.read(stamp_ns, names, displacements, arrival_ns)
             if not self.ownership.owned:
-                self._begin_output(Kind.STREAM, now_ns)
+                self.ownership.begin_output(now_ns)
         except RejectedError as error:
-            counts.by_cause[error.cause] += 1
+            self.counts.reject(error)
             raise
         for axis in axes:
             axis.end_ramp(now_ns)
         stamps = [axis.samples.stamps for axis in axes]
         aheads = [each.accept(stamp_ns) if stamp_ns else each.arrive(arrival_ns) for each in stamps]
         held, slewing = self._move(axes, names, displacements, aheads, now_ns)
-        counts.note(aheads, self.messages.jump, held, slewing)
+        self.counts.note(aheads, self.messages.jump, held, slewing)
         return held
 
     def measure(self, names: Sequence[str], displacements: Sequence[float], now_ns: int, fresh: bool = True) -> None:
@@ -342,7 +339,7 @@ class Controller:
                 try:
                     axis.measure(y, now_ns, fresh)
                 except RejectedError as error:
-                    self.counts.measured_by_cause[error.cause] += 1
+                    self.counts.reject(error, "measurements_rejected")
                     rejected = RejectedError(error.cause, f"axis '{name}': {error}")
         if rejected:
             raise rejected
@@ -367,7 +364,7 @@ class Controller:
             axis.update(ahead, y, now_ns)
             held, slewing = held or axis.held, slewing or axis.slewing
             began = began or (axis.held and not was_held)
-        self.counts.excursions += began
+        self.counts["excursions"] += began
         self.watchdog.commanded = True
         self.watchdog.feed(now_ns)
         return held, slewing
@@ -385,7 +382,7 @@ class Controller:
     ) -> None:
         """Start a trajectory, or raise and keep the current one; times (N,), positions (N, K) in m; empty: cancel."""
         # `start_ns` is on the trajectory clock; 0 starts at once.
-        self.counts.trajectories += 1
+        self.counts["trajectories"] += 1
         if not len(time_from_start_ns):  # type: ignore[arg-type]
             self.watchdog.feed(now_ns)
             if self.trajectory.on:
@@ -396,7 +393,7 @@ class Controller:
             delays = {axis.name: axis.model.chain.delay for axis in self.axes if axis.model}
             self.trajectory.start(path, clock_ns, delays, {axis.name: axis.stream for axis in self.axes})
         except RejectedError:
-            self.counts.trajectories_rejected += 1
+            self.counts["trajectories_rejected"] += 1
             raise
         self._clock_ahead_ns = clock_ns - now_ns
         self.watchdog.feed(now_ns)
@@ -414,7 +411,7 @@ class Controller:
         It is checked as a whole, or raises and nothing changes. Until `hear_block` has heard of its end nothing else
         moves.
         """
-        self.counts.trajectories += 1
+        self.counts["trajectories"] += 1
         try:
             path = self._path(Kind.BLOCK, names, time_from_start_ns, positions, 0, now_ns)
             for axis in self.axes:
@@ -425,7 +422,7 @@ class Controller:
                 self._end_block(now_ns)
                 raise
         except RejectedError:
-            self.counts.trajectories_rejected += 1
+            self.counts["trajectories_rejected"] += 1
             raise
         self.trajectory.too_fast = block.missed
         self.block = BlockFollower(block, self.messages.by_name, now_ns)
@@ -439,7 +436,7 @@ class Controller:
         self._require(kind, now_ns)
         path = Trajectory.of(names, times, positions, start_ns, axes=self.names)
         path.check_reach({axis.name: axis.stream.accepted for axis in self.axes})
-        self._begin_output(kind, now_ns)
+        self.ownership.begin_output(now_ns)
         return path
 
     def hear_block(self, stamp_ns: int, state: str, sample: int, reason: str, now_ns: int) -> bool:
@@ -484,8 +481,8 @@ class Controller:
         aheads = [axis.samples.point(point.deadline_ns) for axis in axes]
         held, slewing = self._move(axes, point.names, point.displacements, aheads, now_ns)
         if not point.between:
-            self.counts.points_held += held
-            self.counts.points_slewing += slewing
+            self.counts["points_held_at_limit"] += held
+            self.counts["points_slew_limited"] += slewing
         self.trajectory.look_ahead()
         if not self.trajectory.on:
             for axis in self.axes:
@@ -531,8 +528,8 @@ class Controller:
             new = axis.tick(now_ns, axis.name in moving) or new
             if axis.held and not was_held:
                 # What the slew limit held back of a message is out of reach.
-                self.counts.held_at_limit += 1
-                self.counts.excursions += 1
+                self.counts["held_at_limit"] += 1
+                self.counts["excursions"] += 1
         if resetting and self.mode is not OperatingMode.RESETTING:
             # The watchdog is suspended during a reset.
             self.watchdog.feed(now_ns)
@@ -554,7 +551,8 @@ class Controller:
 
     def ramp(self, voltages: Sequence[float], rate: float, now_ns: int) -> None:
         """Start a ramp to `voltages` (V, one per axis, clipped to the limits) at `rate` (V/s)."""
-        self._begin_output(Kind.RAMP, now_ns)
+        self._require(Kind.RAMP, now_ns)
+        self.ownership.begin_output(now_ns)
         self.trajectory.cancel()
         for axis, voltage in zip(self.axes, voltages, strict=True):
             axis.begin(Ramp([voltage], rate), now_ns)
@@ -563,7 +561,8 @@ class Controller:
         self, cycles: int, rate: float, finals: Sequence[float], now_ns: int, spans: Sequence[tuple[float, float]] = ()
     ) -> None:
         """Start the decaying oscillation that resets the memory, to `finals` (V), within `spans` (V; the limits)."""
-        self._begin_output(Kind.RESET, now_ns)
+        self._require(Kind.RESET, now_ns)
+        self.ownership.begin_output(now_ns)
         limits = reset_limits(self.axes, spans)
         turns = [decaying_turns(each, each.clip(v), cycles) for v, each in zip(finals, limits, strict=True)]
         for axis, goals in zip(self.axes, turns, strict=True):

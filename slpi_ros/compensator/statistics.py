@@ -1,59 +1,44 @@
 """Message counters, latency and tracking error of a compensator."""
 
 from array import array
+from collections import Counter
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from slpi_ros.compensator.validation import CAUSES, MEASURED_CAUSES
+from slpi_ros.compensator.validation import CAUSES, MEASURED_CAUSES, RejectedError
+
+# What is counted, by the names that /diagnostics shows.
+COUNTED = (
+    "received", "accepted", "rejected", *(f"rejected.{cause}" for cause in CAUSES), "measurements_rejected",
+    *(f"measurements_rejected.{cause}" for cause in MEASURED_CAUSES), "held_at_limit", "excursions", "slew_limited",
+    "trajectories", "messages_lost", "worked_off", "largest_backlog", "trajectories_rejected", "points_skipped",
+    "points_held_at_limit", "points_slew_limited", "gaps", "time_jumps", "models_refused",
+)  # fmt: skip
 
 
-@dataclass
-class Counts:
-    """Message counters of a compensator."""
+class Counts(Counter[str]):
+    """Counters of a compensator: of desired messages, readings, trajectories and their points (`COUNTED`).
 
-    received: int = 0  # messages with desired displacements
-    accepted: int = 0
-    held_at_limit: int = 0  # of the accepted: an axis was held at a voltage limit
-    slew_limited: int = 0  # of the accepted: slew or acceleration kept an axis from its setpoint
-    excursions: int = 0  # how often an axis began to be held at a voltage limit
-    gaps: int = 0  # stamped more than `time_jump` after the previous message
-    time_jumps: int = 0  # stamped before the previous message: the clock had been set back
-    by_cause: dict[str, int] = field(default_factory=lambda: dict.fromkeys(CAUSES, 0))
-    measured_by_cause: dict[str, int] = field(default_factory=lambda: dict.fromkeys(MEASURED_CAUSES, 0))
-    trajectories: int = 0
-    trajectories_rejected: int = 0
-    points_held: int = 0
-    points_slewing: int = 0
-    lost: int = 0  # messages, by the middleware
-    worked_off: int = 0  # messages that had waited
-    largest_backlog: int = 0
-    models_refused: int = 0
-
-    @property
-    def rejected(self) -> int:
-        """Number of rejected messages."""
-        return self.received - self.accepted
-
-    @property
-    def measurements_rejected(self) -> int:
-        """Number of rejected measured displacements."""
-        return sum(self.measured_by_cause.values())
+    An excursion is each time that an axis begins to be held at a voltage limit; a gap is stamped more than `time_jump`
+    after the message before, a time jump before it, as the clock had been set back.
+    """
 
     def note(self, aheads: Sequence[float | None], jump: float, held: bool, slewing: bool) -> None:
         """Count an accepted message, `aheads` (s) after the last one of each axis by its stamp."""
-        self.accepted += 1
-        self.held_at_limit += held
-        self.slew_limited += slewing
+        self["accepted"] += 1
+        self["held_at_limit"] += held
+        self["slew_limited"] += slewing
         known = [each for each in aheads if each is not None]
         if known:
-            self.gaps += max(known) > jump
-            self.time_jumps += min(known) < 0.0
+            self["gaps"] += max(known) > jump
+            self["time_jumps"] += min(known) < 0.0
 
-    def copy(self) -> "Counts":
-        """Return a copy of the present counts."""
-        return replace(self, by_cause=dict(self.by_cause), measured_by_cause=dict(self.measured_by_cause))
+    def reject(self, error: RejectedError, what: str = "rejected") -> None:
+        """Count a rejection of a message or a reading by its cause."""
+        self[what] += 1
+        self[f"{what}.{error.cause}"] += 1
 
 
 # Maximum number of messages in the statistics.

@@ -1,10 +1,9 @@
 """A calibration in a worker process: it computes, and asks the node that drives the stage for each record."""
 
-import json
 import multiprocessing
 import os
 import threading
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 
@@ -14,7 +13,7 @@ from slpi_ros.arrays import FloatArray
 from slpi_ros.calibration.kept import REMEDY
 from slpi_ros.calibration.run import Progress, Recording, Request, aligned, calibrate
 from slpi_ros.calibration.settings import CalibrationSettings
-from slpi_ros.errors import RecordError, SlpiError
+from slpi_ros.errors import SlpiError
 from slpi_ros.io.bag_reader import read_bag
 from slpi_ros.nodes.jobs import WorkerProcess
 
@@ -65,20 +64,14 @@ class CalibrationJob:
     def said(self) -> Progress | Wanted | None:
         """Return what the worker has said, if anything: its progress, or a drive that it wants; does not block."""
         try:
-            if not self._own.poll():
-                return None
-            said = json.loads(self._own.recv_bytes())
-            if "progress" in said:
-                return Progress(**said["progress"])
-            count, columns = said["axes"], np.frombuffer(self._own.recv_bytes())
+            said: Progress | Wanted | None = self._own.recv() if self._own.poll() else None
         except (EOFError, OSError):
             return None
-        columns = columns.reshape(said["samples"], -1)
-        return Wanted(said["name"], columns[:, 0], columns[:, 1 : count + 1], columns[:, count + 1 :])
+        return said
 
-    def recorded(self, error: str = "") -> None:
-        """Tell the worker that its drive is recorded, or why it is not."""
-        self._own.send_bytes(json.dumps(error).encode())
+    def recorded(self) -> None:
+        """Tell the worker that its drive is recorded."""
+        self._own.send(None)
 
     def outcome(self) -> CalibrationOutcome | None:
         """Return the outcome, or None while the worker is running; does not block."""
@@ -99,17 +92,16 @@ def run_calibration(request: CalibrationRequest) -> CalibrationOutcome:
     threading.Thread(target=_end_with_parent, daemon=True).start()
     node, output = request.node, Path(request.output)
 
-    def report(progress: Progress) -> None:
-        node.send_bytes(json.dumps({"progress": asdict(progress)}).encode())
-
     def record(wanted: Request) -> Recording:
         kept = (output / wanted.name).exists()
         if not kept:
-            _ask(node, wanted)
+            columns = np.column_stack([*wanted.drive.voltage.values(), *wanted.desired.values()])
+            node.send(Wanted(wanted.name, wanted.drive.t, *np.split(columns, [len(wanted.drive.voltage)], axis=1)))
+            node.recv()
         return replace(recording_of(output, wanted), kept=kept)
 
     try:
-        outcome = calibrate(request.settings, record, report)
+        outcome = calibrate(request.settings, record, node.send)
         write_files(output, outcome)
     except SlpiError as error:
         return CalibrationOutcome(error=str(error), exit_code=error.exit_code)
@@ -125,18 +117,6 @@ def recording_of(output: Path, wanted: Request) -> Recording:
     except SlpiError as error:
         raise type(error)(f"{error}; {REMEDY}") from None
     return Recording(record, {}) if sent is None else aligned(record, sent.time_ns, sent.voltage, sent.displacement)
-
-
-def _ask(node: Connection, wanted: Request) -> None:
-    """Ask the node for a record and wait for it; RecordError if it cannot be had."""
-    drive = wanted.drive
-    columns = np.column_stack([drive.t, *drive.voltage.values(), *wanted.desired.values()])
-    said = {"name": wanted.name, "samples": len(columns), "axes": len(drive.voltage)}
-    node.send_bytes(json.dumps(said).encode())
-    node.send_bytes(np.ascontiguousarray(columns).tobytes())
-    error = json.loads(node.recv_bytes())
-    if error:
-        raise RecordError(error)
 
 
 def _end_with_parent() -> None:

@@ -18,82 +18,50 @@ from slpi_ros.calibration.drive_watch import FARTHEST
 from slpi_ros.calibration.run import Progress
 from slpi_ros.calibration.settings import CalibrationSettings
 from slpi_ros.errors import RecordError, SlpiError, UsageError, length
-from slpi_ros.excitation.drives import slew_limits
 from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.bag_files import partial_path
 from slpi_ros.io.bag_writer import BagWriter
 from slpi_ros.io.desired import read_path
 from slpi_ros.io.messages import encode_joint_states
-from slpi_ros.model.limits import Limits
+from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.calibration_job import PATH, STATE, CalibrationJob, CalibrationOutcome, Wanted
 from slpi_ros.nodes.common import LATCHED, WARN, Diagnostics, Health, request_stop
 from slpi_ros.nodes.guarded_drive import GuardedDrive
-from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
+from slpi_ros.nodes.parameters import Declaration, Parameters, Values, limits_of, validated
 from slpi_ros.reports.calibration import PAGE
 
-VOLTAGE = (-10_000.0, 10_000.0)
-DECLARATIONS = (
-    Declaration("axes", ["x"], "Names of the axes, in the order of voltage_command.", read_only=True),
-    Declaration(
-        "voltage_min", math.nan, "Lower voltage limit, volts; required. One value, or one for each axis.",
-        read_only=True, number=True,
+DECLARATIONS = declare.read_only(
+    declare.AXES,
+    *declare.voltage_limits(", of which drives use 80 %"),
+    declare.ACCELERATION_LIMIT,
+    declare.each_axis(
+        "rest_voltage", math.nan, "Voltage before and after every drive, volts; NaN: 0 V, or the limit next to it.",
+        declare.VOLTAGE,
     ),
-    Declaration(
-        "voltage_max", math.nan, "Upper voltage limit, volts; required. One value, or one for each axis.",
-        read_only=True, number=True,
-    ),
-    Declaration(
-        "slew_limit", math.nan,
-        "Maximum rate of a voltage, V/s, of which drives use 80 %; NaN: the voltage range in 0.1 s. 0: no limit. One "
-        "value, or one for each axis.",
-        read_only=True, between=(0.0, 1e9), number=True, each_axis=True,
-    ),
-    Declaration(
-        "acceleration_limit", 0.0,
-        "Maximum change of the rate of a voltage, V/s^2; 0: no limit. One value, or one for each axis.",
-        read_only=True, between=(0.0, 1e12), number=True, each_axis=True,
-    ),
-    Declaration(
-        "rest_voltage", math.nan,
-        "Voltage before and after every drive, volts; NaN: 0 V, or the limit next to it. One value, or one for each "
-        "axis.",
-        read_only=True, number=True,
-    ),
-    Declaration("rate", 200.0, "Samples per second, hertz.", read_only=True, between=(10.0, 10_000.0), number=True),
-    Declaration(
-        "budget", 240.0, "Time for all drives, seconds for each axis.",
-        read_only=True, between=(1.0, 86_400.0), number=True,
-    ),
-    Declaration(
+    declare.scalar("rate", 200.0, "Samples per second, hertz.", (10.0, 10_000.0)),
+    declare.scalar("budget", 240.0, "Time for all drives, seconds for each axis.", (1.0, 86_400.0)),
+    declare.scalar(
         "target", 0.0, "Largest mean error on a path not in the records, micrometres; 0: times_repeatability.",
-        read_only=True, between=(0.0, 1e6), number=True,
+        (0.0, 1e6),
     ),
-    Declaration(
-        "times_repeatability", 3.0, "Target in multiples of the repeatability, if target is 0.",
-        read_only=True, between=(0.1, 1e6), number=True,
+    declare.scalar(
+        "times_repeatability", 3.0, "Target in multiples of the repeatability, if target is 0.", (0.1, 1e6)
     ),
-    Declaration(
+    declare.text(
         "desired_path", "",
         "Table (time_s, AXIS_m) or bag with the path that the records must cover, and on which models are verified; at "
         "its rate, range and turns. Empty: random paths. Give a rate at which the path can be sampled.",
-        read_only=True,
     ),
-    Declaration("output", "", "Folder for bags, model, diagnosis and page; required.", read_only=True),
-    Declaration(
-        "resume", False, "Whether to go on with the complete bags that output holds already.", read_only=True
-    ),
-    Declaration("seed", 0, "Seed of the random parts of the drives.", read_only=True, between=(0, 2**31 - 1)),
-    Declaration(
-        "state_timeout", 0.5,
-        "Seconds without a valid stage_state after which a drive is given up; reports of the voltage may be as late.",
-        read_only=True, between=(1e-3, 60.0), number=True,
-    ),
-    Declaration(
+    declare.text("output", "", "Folder for bags, model, diagnosis and page; required."),
+    Declaration("resume", False, "Whether to go on with the complete bags that output holds already."),
+    Declaration("seed", 0, "Seed of the random parts of the drives.", between=(0, 2**31 - 1)),
+    declare.STATE_TIMEOUT,
+    declare.scalar(
         "patience", 30.0,
         "Seconds to wait for stage_state, for a subscriber of voltage_command and for its other publishers to end.",
-        read_only=True, between=(0.1, 3600.0), number=True,
+        (0.1, 3600.0),
     ),
-    Declaration("autostart", True, "Whether to start at once; if false, ~/start starts.", read_only=True),
+    Declaration("autostart", True, "Whether to start at once; if false, ~/start starts."),
 )  # fmt: skip
 
 # Longest step of a drive (in periods of the rate) that follows a late sample.
@@ -134,19 +102,11 @@ def settings_of(values: Values) -> CalibrationSettings:
     checked, axes = validated(DECLARATIONS, values), tuple(values["axes"])
     if not checked["output"]:
         raise UsageError("calibrator: no output; name the folder with --ros-args -p output:=FOLDER")
-    lows, highs = (numbers(values, name, axes, *VOLTAGE) for name in ("voltage_min", "voltage_max"))
-    limits = tuple(
-        Limits(low, high, slew or math.inf, acceleration or math.inf)
-        for low, high, slew, acceleration in zip(
-            lows, highs, slew_limits(checked["slew_limit"], lows, highs), checked["acceleration_limit"], strict=True
-        )
-    )
-    rest = values["rest_voltage"]
-    given = numbers(values, "rest_voltage", axes, *VOLTAGE) if rest == rest else [each.clip(0.0) for each in limits]
+    limits = limits_of(checked)
     return CalibrationSettings(
         axes=axes,
         limits=limits,
-        rest=tuple(given),
+        rest=checked["rest_voltage"] or tuple(each.clip(0.0) for each in limits),
         rate=checked["rate"],
         budget=checked["budget"] * len(axes),
         target=checked["target"] * 1e-6,

@@ -3,11 +3,9 @@
 import ctypes
 import importlib
 import os
-import signal
 import sys
-import threading
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager, suppress
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -16,6 +14,7 @@ import numpy as np
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lifecycle_msgs.srv import ChangeState
+from rclpy.clock import Clock, ClockType
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -24,6 +23,7 @@ from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy, qos_profile_sensor_data
 from rclpy.serialization import deserialize_message
 from rclpy.signals import SignalHandlerOptions
+from rclpy.timer import Timer
 from rclpy.utilities import ok, try_shutdown
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
@@ -32,7 +32,7 @@ from trajectory_msgs.msg import JointTrajectory
 from slpi_ros.errors import RecordError, SlpiError, UsageError, shown
 from slpi_ros.io.messages import SECOND_NS, TrajectoryArrays, decode_trajectory
 from slpi_ros.nodes import stop
-from slpi_ros.nodes.stop import SIGNALS, Stop
+from slpi_ros.nodes.stop import Stop
 
 COMMANDS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 # Late subscribers receive the last message.
@@ -122,6 +122,22 @@ def _refusing(node: LifecycleNode, change_state: Any) -> Any:
     return on_request
 
 
+def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
+    """Create a timer with a `period` (s) of a clock that neither stops, as a simulated one may, nor is set back."""
+    return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+
+
+def reliability_of(publishers: Sequence[Any]) -> ReliabilityPolicy:
+    """Return the reliability that all publishers of a topic offer."""
+    reliable = all(each.qos_profile.reliability == ReliabilityPolicy.RELIABLE for each in publishers)
+    return ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
+
+
+def full_name(namespace: str, name: str) -> str:
+    """Return the full name of a node."""
+    return f"{namespace.rstrip('/')}/{name}"
+
+
 def message_class(topic: str, msgtype: str) -> Any:
     """Return the class of a message type; RecordError, which names the topic, if it is not installed."""
     package, kind, name = msgtype.split("/")
@@ -139,7 +155,7 @@ def publishers_beside(node: Node, topic: str) -> list[str]:
     names = [(each.node_name, each.node_namespace) for each in node.get_publishers_info_by_topic(topic)]
     if own in names:
         names.remove(own)
-    return sorted(f"{namespace.rstrip('/')}/{name}" for name, namespace in names)
+    return sorted(full_name(namespace, name) for name, namespace in names)
 
 
 def ask_for_priority(node: Node, priority: int) -> None:
@@ -263,19 +279,18 @@ def run(make_node: Callable[[], Node], *, executor: str = "events") -> int:
     # The ROS context stays valid until the node's ``destroy_node`` has returned, so that the node may still publish in
     # that method. A node with an attribute `executor_kind` chooses its executor itself.
     global _stop
-    _stop = stop.of_process or Stop()
-    with _signals_to(_stop.on_signal):
-        try:
-            # A signal may have arrived during the imports.
-            if not _stop.requested:
-                _live(make_node, executor)
-        except (KeyboardInterrupt, ExternalShutdownException):
-            return 0
-        except SlpiError as error:
-            print(error, file=sys.stderr, flush=True)
-            return error.exit_code
-        finally:
-            try_shutdown()
+    _stop = stop.of_process or stop.listening()
+    try:
+        # A signal may have arrived during the imports.
+        if not _stop.requested:
+            _live(make_node, executor)
+    except (KeyboardInterrupt, ExternalShutdownException):
+        return 0
+    except SlpiError as error:
+        print(error, file=sys.stderr, flush=True)
+        return error.exit_code
+    finally:
+        try_shutdown()
     return 0
 
 
@@ -309,16 +324,3 @@ def _live(make_node: Callable[[], Node], kind: str) -> None:
             request_stop(error)
     if _stop.failure is not None:
         raise _stop.failure
-
-
-@contextmanager
-def _signals_to(handler: Callable[..., None]) -> Iterator[None]:
-    """Install a handler for SIGINT and SIGTERM for the duration of the ``with`` block."""
-    # Python allows signal handlers in the main thread only; in other threads none is set.
-    numbers = SIGNALS if threading.current_thread() is threading.main_thread() else ()
-    previous = {number: signal.signal(number, handler) for number in numbers}
-    try:
-        yield
-    finally:
-        for number, old in previous.items():
-            signal.signal(number, old)

@@ -19,21 +19,17 @@ from trajectory_msgs.msg import JointTrajectory
 from slpi_ros.compensator.amplifier import REARM_NS, Calibration
 from slpi_ros.compensator.controller import Controller, OperatingMode, StopReason
 from slpi_ros.compensator.ownership import AUTO
-from slpi_ros.compensator.persistence import KNOWN, RESTORED
-from slpi_ros.compensator.validation import STALE, RejectedError
-from slpi_ros.errors import SlpiError, shown
-from slpi_ros.io.messages import SECOND_NS, JointStates, TrajectoryArrays, decode_trajectory
+from slpi_ros.compensator.validation import RejectedError
+from slpi_ros.errors import SlpiError
+from slpi_ros.io.messages import SECOND_NS, JointStates
 from slpi_ros.model.limits import volts
 from slpi_ros.nodes.common import (
     COMMANDS,
     LATCHED,
     MEASUREMENTS,
-    WARN,
-    DeferredService,
     as_rclpy_reads,
     ask_for_priority,
     keep_freed_memory,
-    read_trajectory,
     refuse_impossible_transitions,
 )
 from slpi_ros.nodes.compensator_diagnostics import Reporter
@@ -41,6 +37,7 @@ from slpi_ros.nodes.compensator_memory import Memory
 from slpi_ros.nodes.compensator_models import Models
 from slpi_ros.nodes.compensator_output import OVERRIDABLE, Output
 from slpi_ros.nodes.compensator_parameters import DECLARATIONS, CompensatorSettings
+from slpi_ros.nodes.compensator_paths import Paths
 from slpi_ros.nodes.parameters import Parameters
 from slpi_ros.nodes.path_learning import OFF, PathLearning
 from slpi_ros.nodes.surroundings import SurroundingsTopics
@@ -84,23 +81,21 @@ class Compensator(LifecycleNode):
         )  # fmt: skip
         self._parameter_set.follow(self._use_settings, check=self._check_settings)
         learned_files = f"{values['memory_file']}.learned" if values["memory_file"] else ""
-        self._learning = PathLearning(controller, learned_files, self._on_forgotten)
+        self._learning = PathLearning(controller, learned_files, lambda count: self._paths.on_forgotten(count))
         self._use_learning(settings)
         self._reporter = Reporter(self, controller, self._learning, lambda: self._settings)
         self._memory = Memory(self, controller, values["memory_file"], self._reporter)
+        self._paths = Paths(self, controller, self._learning, self._memory, self._reporter)
         self._models = Models(self, controller, self._memory, self._learning, self._reporter)
         self._surroundings = SurroundingsTopics(self, controller)
         self._desired, self._measured = JointStates(), JointStates()
         self._output: Output
         self._inputs: list[Any] = []  # subscriptions of the configured state, the desired displacements first
-        self._forget_service = DeferredService(self, "~/forget", self._on_forget)
         self.create_service(Trigger, "~/arm", self._on_arm)
-        self.create_service(Trigger, "~/set_zero", self._on_set_zero)
         self._state_subscription = self.create_subscription(
             JointState, "stage_state", self._on_state, MEASUREMENTS, raw=True
         )
         self._begun_ns, self._reported_ns = time.monotonic_ns(), 0
-        self._on_simulated = False  # whether the times of the trajectory are those of a simulated clock
         # The steady clock, as a simulated one may stop while the amplifier moves in real time.
         steady = Clock(clock_type=ClockType.STEADY_TIME)
         self.create_timer(values["diagnostic_period"], self._on_period, clock=steady)
@@ -152,7 +147,7 @@ class Compensator(LifecycleNode):
             # Until this node may know whether stage_state has a publisher: commands are not taken before that.
             while not self._is_reported and time.monotonic_ns() - self._begun_ns < DISCOVERY_NS and self.context.ok():
                 time.sleep(DISCOVERY_POLL)
-        self._output = Output(self, self._controller, self._memory, self._reporter)
+        self._paths.output = self._output = Output(self, self._controller, self._memory, self._reporter)
         on_desired: dict[str, tuple[Any, Any]] = {
             "JointState": (JointState, self._on_joint_state),
             "Float64": (Float64, lambda message: self._answer(0, self._controller.names, (message.data,))),
@@ -163,11 +158,11 @@ class Compensator(LifecycleNode):
         kind, callback = on_desired[self._settings.values["desired_type"]]
         self._inputs = [
             self._subscribe(kind, "desired_displacement", callback, COMMANDS, raw=kind is JointState),
-            self._subscribe(JointTrajectory, "desired_trajectory", self._on_trajectory, COMMANDS, raw=True),
+            self._subscribe(JointTrajectory, "desired_trajectory", self._paths.on_trajectory, COMMANDS, raw=True),
             self._subscribe(JointState, "measured_displacement", self._on_measured, MEASUREMENTS, raw=True),
             self._subscribe(String, "stage_model", self._models.on_message, LATCHED),
-            self._subscribe(DiagnosticStatus, "voltage_trajectory_state", self._on_block_state, LATCHED),
-            self._subscribe(JointTrajectory, "recorded_trajectory", self._on_recorded, COMMANDS, raw=True),
+            self._subscribe(DiagnosticStatus, "voltage_trajectory_state", self._paths.on_block_state, LATCHED),
+            self._subscribe(JointTrajectory, "recorded_trajectory", self._paths.on_recorded, COMMANDS, raw=True),
         ]
         self._controller.configure()
         self._reporter.report()
@@ -262,7 +257,7 @@ class Compensator(LifecycleNode):
         try:
             held = controller.update(stamp_ns, names, displacements, now_ns, arrival_ns)
         except RejectedError as error:
-            self._reject(error)
+            self._reporter.reject(error)
             return
         self._output.publish()
         if stamp_ns and reporter.age is None:
@@ -277,29 +272,19 @@ class Compensator(LifecycleNode):
         age_ns = self.get_clock().now().nanoseconds - stamp_ns if stamp_ns else 0
         fresh = -EARLIEST_NS <= age_ns <= OLDEST_NS
         if self._learning.passes.on and fresh:
-            self._learning.passes.read(names, displacements, self._clocks()[1] - age_ns)
+            self._learning.passes.read(names, displacements, self._paths.clocks()[1] - age_ns)
         try:
             self._controller.measure(names, displacements, time.monotonic_ns(), fresh)
         except RejectedError as error:
-            self._reject(error)
-
-    def _reject(self, error: RejectedError) -> None:
-        """Report the rejection of a message, which the controller has counted already."""
-        self._reporter.last_rejection = error.cause, str(error)
-        self._report_warning()
-
-    def _report_warning(self) -> None:
-        """Report now, unless the last report was one of a problem."""
-        if self._reporter.level < WARN:
-            self._reporter.report()
+            self._reporter.reject(error)
 
     def _report_held(self) -> None:
         self._reporter.note_out_of_reach()
-        self._report_warning()
+        self._reporter.report_warning()
 
     def _on_lost(self, event: Any) -> None:
-        self._controller.counts.lost += event.total_count_change
-        self._report_warning()
+        self._controller.counts["messages_lost"] += event.total_count_change
+        self._reporter.report_warning()
 
     def _work_off(self) -> None:
         """Answer the desired messages that wait: after a stall the executor takes one for each that comes, no more."""
@@ -311,8 +296,8 @@ class Compensator(LifecycleNode):
                 break
             subscription.callback(taken[0])
             count += 1
-        counts.worked_off += count
-        counts.largest_backlog = max(counts.largest_backlog, count)
+        counts["worked_off"] += count
+        counts["largest_backlog"] = max(counts["largest_backlog"], count)
 
     # The amplifier
 
@@ -353,9 +338,9 @@ class Compensator(LifecycleNode):
         ownership = self._controller.ownership
         for axis in self._controller.axes:
             if not ownership.obstacle and (note := ownership.notes.get(axis.name)):
-                self._reporter.remark(f"{axis.name} start", f"axis '{axis.name}': {note}")
+                self._reporter.log.remark(f"{axis.name} start", f"axis '{axis.name}': {note}")
             doubt = axis.confidence.doubt
-            self._reporter.remark(f"{axis.name} doubt", f"axis '{axis.name}': {doubt}" if doubt else "")
+            self._reporter.log.remark(f"{axis.name} doubt", f"axis '{axis.name}': {doubt}" if doubt else "")
 
     def _on_arm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Go on from where somebody else has moved the stage."""
@@ -370,146 +355,36 @@ class Compensator(LifecycleNode):
             self._reporter.report()
         return response
 
-    def _on_set_zero(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        """Let the zeros of the models agree with the sensors; nothing moves."""
-        try:
-            moved = self._controller.set_zero(time.monotonic_ns())
-        except SlpiError as error:
-            response.success, response.message = False, f"not set: {error}"
-            return response
-        said = [
-            f"axis '{name}': the zero moves by {offset * 1e6:+.4f} µm"
-            if offset is not None
-            else f"axis '{name}': not set, no measured_displacement in the last 0.2 s; remap it to that of the sensor"
-            for name, offset in moved.items()
-        ]
-        unsure = [axis.name for axis in self._controller.axes if axis.confidence.state not in (KNOWN, RESTORED)]
-        if unsure:
-            said.append(f"the memory of axis {', '.join(unsure)} is assumed: reset it, then set the zero again")
-        response.success, response.message = None not in moved.values(), "; ".join(said)
-        self.get_logger().info(f"~/set_zero: {response.message}")
-        self._memory.save(complete=False)
-        self._reporter.report()
-        return response
-
-    # Trajectories and blocks
-
-    def _on_trajectory(self, data: bytes) -> None:
-        controller, path = self._controller, read_trajectory(data)
-        now_ns, clock_ns = self._clocks()
-        points = path.time_from_start_ns.size
-        start_ns = path.start_ns + clock_ns - self.get_clock().now().nanoseconds if path.start_ns else 0
-        try:
-            if controller.mode is OperatingMode.BLOCK and not points:
-                self._output.stop_block()
-                return
-            if self._settings.values["trajectory_output"] == "block" and points:
-                said = self._send_block(path, start_ns > clock_ns)
-            else:
-                said = self._follow(path, start_ns, now_ns, clock_ns)
-        except RejectedError as error:
-            self._reject(error)
-            return
-        self.get_logger().info(said)
-        self._reporter.report()
-
-    def _follow(self, given: TrajectoryArrays, start_ns: int, now_ns: int, clock_ns: int) -> str:
-        """Begin a trajectory that is output sample by sample; return what is logged of it."""
-        path, samples = self._learning.corrected(given.names, given.time_from_start_ns, given.values)
-        self._controller.follow(*samples, start_ns, now_ns, clock_ns)
-        self._learning.begin(path, start_ns, clock_ns)
-        self._on_simulated = self._simulated
-        return f"trajectory: {self._controller.trajectory.remaining} points to come"
-
-    def _send_block(self, given: TrajectoryArrays, later: bool) -> str:
-        """Publish a trajectory as one block of voltages; return what is logged of it."""
-        if later:
-            raise RejectedError(STALE, "a block begins as soon as the device has it; stamp the trajectory 0")
-        path, samples = self._learning.corrected(given.names, given.time_from_start_ns, given.values, as_block=True)
-        stamp_ns = self.get_clock().now().nanoseconds
-        block = self._controller.follow_block(*samples, time.monotonic_ns(), stamp_ns)
-        self._learning.begin_block(path, block)
-        self._output.publish_block(block)
-        return f"block: {len(block.voltages)} samples of {block.period:g} s, the path begins after {block.lead_in}"
-
-    def _on_block_state(self, status: DiagnosticStatus) -> None:
-        values = {each.key: each.value for each in status.values}
-        seconds, _, rest = values.get("stamp", "").partition(".")
-        if not (seconds.isdecimal() and rest.isdecimal() and values.get("sample", "").isdecimal()):
-            return
-        stamp_ns, reason = int(seconds) * SECOND_NS + int(rest), values.get("reason", "")
-        sample, now_ns = int(values["sample"]), time.monotonic_ns()
-        if self._controller.hear_block(stamp_ns, status.message, sample, reason, now_ns):
-            block = self._controller.block
-            assert block
-            said = f"block {shown(block.state)} at sample {block.sample}{': ' if reason else ''}{shown(reason)}"
-            if block.state == "ended":
-                self.get_logger().info(said)
-            else:
-                self.get_logger().warning(said)
-            self._memory.save(complete=False)
-            self._reporter.report()
-
-    def _on_recorded(self, data: bytes) -> None:
-        """Take what a device has recorded of a block."""
-        if self._learning.mode == OFF:
-            return
-        read, applied = decode_trajectory(data), decode_trajectory(data, "effort")
-        if read and applied:
-            self._learning.passes.recorded(
-                read.start_ns, read.names, read.time_from_start_ns, read.values, applied.values
-            )
-
-    def _on_forget(self) -> str:
-        """Forget what was learned; answered when the files are removed."""
-        self._learning.forget()
-        return ""
-
-    def _on_forgotten(self, count: int) -> None:
-        self._forget_service.answer(True, f"forgotten: {count} {'path' if count == 1 else 'paths'}")
-        self._reporter.report()
-
     # Motion without messages
-
-    def _clocks(self) -> tuple[int, int]:
-        """Return the times on the monotonic clock and on the trajectory clock, nanoseconds."""
-        now_ns = time.monotonic_ns()
-        return now_ns, self.get_clock().now().nanoseconds if self._simulated else now_ns
-
-    @property
-    def _simulated(self) -> bool:
-        return bool(self.get_clock().ros_time_is_active)
 
     def seconds_to_deadline(self) -> float:
         """Return the time (s) until the next call of `meet_deadline`; infinite if no motion is pending."""
         # Without pending motion there is no deadline, whatever the time is.
         if self._controller.next_due_ns(0, 0) is None:
             return math.inf
-        now_ns, clock_ns = self._clocks()
+        now_ns, clock_ns = self._paths.clocks()
         due_ns = self._controller.next_due_ns(now_ns, clock_ns)
         seconds = max((due_ns or 0) - now_ns, 0) * 1e-9
-        return min(seconds, SIMULATED_PERIOD) if self._simulated else seconds
+        return min(seconds, SIMULATED_PERIOD) if self._paths.simulated else seconds
 
     def meet_deadline(self) -> None:
         """Execute what is due of the motion without messages, if anything."""
         controller, reporter = self._controller, self._reporter
         if controller.next_due_ns(0, 0) is None:
             return
-        now_ns, clock_ns = self._clocks()
+        now_ns, clock_ns = self._paths.clocks()
         before = controller.mode
-        if before is OperatingMode.TRAJECTORY and self._on_simulated != self._simulated:
-            controller.stop(StopReason.CANCELED, now_ns)
-            self.get_logger().error("use_sim_time was changed: trajectory canceled, as its times are no longer valid")
+        self._paths.check_clock(now_ns)
         # One point per call, so that callbacks run even if points are due faster than they can be processed.
         deadline_ns, counts = controller.trajectory.next_deadline_ns, controller.counts
-        held = counts.points_held, counts.excursions
+        held = counts["points_held_at_limit"], counts["excursions"]
         if controller.advance(now_ns, clock_ns):
             self._output.publish()
             if self._learning.passes.on:
                 self._learning.passes.output(controller.axes, clock_ns)
             if before is OperatingMode.TRAJECTORY and deadline_ns is not None and deadline_ns <= clock_ns:
                 reporter.lateness.note(deadline_ns, clock_ns)
-            if (counts.points_held, counts.excursions) != held:
+            if (counts["points_held_at_limit"], counts["excursions"]) != held:
                 self._report_held()
         if controller.mode is not before:
             if before is OperatingMode.RESETTING:
@@ -527,7 +402,7 @@ class Compensator(LifecycleNode):
     def _watch(self) -> None:
         controller, reporter, values = self._controller, self._reporter, self._settings.values
         if self._learning.mode != OFF or self._learning.waiting:
-            self._learning.poll(self._clocks()[1])
+            self._learning.poll(self._paths.clocks()[1])
         while self._learning.remarks:
             self.get_logger().warning(self._learning.remarks.popleft())
         if not controller.active:
@@ -543,7 +418,7 @@ class Compensator(LifecycleNode):
             if found != Calibration():
                 said = f"reports {found.gain:.4g} times the output {found.offset:+.4g} V (effort)"
                 said = f"axis '{axis.name}': stage_state {said}: a matter of calibration, it is not followed"
-                reporter.remark(f"{axis.name} calibration", said)
+                reporter.log.remark(f"{axis.name} calibration", said)
         news = controller.watch(self._settings.safety, values["feedback_fault_time"], now_ns)
         if why := controller.watch_block(now_ns):
             self.get_logger().error(f"block given up: {why}")

@@ -11,7 +11,8 @@ from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.feedback import Drift
 from slpi_ros.compensator.persistence import KNOWN, RESETTING, RESTORED
-from slpi_ros.compensator.statistics import Timing, TimingReport
+from slpi_ros.compensator.statistics import COUNTED, Counts, Timing, TimingReport
+from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.model.stage_model import StageModel, seconds_since
 from slpi_ros.nodes.common import ERROR, WARN, Diagnostics, Health
 from slpi_ros.nodes.compensator_parameters import CompensatorSettings
@@ -33,6 +34,35 @@ class Problem(NamedTuple):
     text: str
 
 
+class Log:
+    """Log each problem when it appears, and each remark once."""
+
+    def __init__(self, node: Node) -> None:
+        self._logger = node.get_logger()
+        self._logged: dict[str, float] = {}  # time (s) of the last message, by kind
+        self._present: Collection[str] = ()  # kinds of problems in the last report
+        self._remarks: dict[str, str] = {}  # the last one, by kind
+
+    def remark(self, kind: str, text: str) -> None:
+        """Log a remark, unless the last one of its kind was the same; "": there is none any more."""
+        if text and text != self._remarks.get(kind):
+            self._logger.warning(text)
+        self._remarks[kind] = text
+
+    def tell(self, problems: Iterable[Problem]) -> None:
+        """Log the problems that the last report did not hold, those of one kind once in `LOG_PERIOD`."""
+        now, present = time.monotonic(), {each.kind: each for each in problems if each.kind}
+        for kind, (_, level, text) in present.items():
+            if kind not in self._present and now - self._logged.get(kind, -math.inf) >= LOG_PERIOD:
+                # Not in one line: a call of the logger keeps its severity.
+                if level == ERROR:
+                    self._logger.error(text)
+                else:
+                    self._logger.warning(text)
+                self._logged[kind] = now
+        self._present = present.keys()
+
+
 class Reporter:
     """Publish the diagnostics of the compensator, and log each problem when it appears."""
 
@@ -52,16 +82,8 @@ class Reporter:
         self.age: float | None = None  # s, of the last answered command by its stamp; None: wanted
         self._out_of_reach = ""
         self._controller, self._learning, self._settings = controller, learning, settings
-        self._logger, self._diagnostics = node.get_logger(), Diagnostics(node, "compensator")
-        self._logged: dict[str, float] = {}  # time (s) of the last message, by kind
-        self._present: Collection[str] = ()  # kinds of problems in the last report
-        self._remarks: dict[str, str] = {}  # the last one, by kind
+        self.log, self._diagnostics = Log(node), Diagnostics(node, "compensator")
         self.start_window()
-
-    @property
-    def level(self) -> bytes:
-        """Diagnostic level of the last report."""
-        return self._diagnostics.level
 
     @property
     def settings(self) -> CompensatorSettings:
@@ -84,26 +106,37 @@ class Reporter:
                 values[f"{key}.value"] = f"{quantity.value:.6g}" if age is not None else ""
                 values[f"{key}.age_s"] = f"{age * 1e-9:.3f}" if age is not None else ""
         problems = list(self._problems(settings))
-        self._log(problems)
+        self.log.tell(problems)
         hardware_id = settings.values["hardware_id"] or (model.hardware_id if model else "")
         told = tuple((each.level, each.text) for each in problems)
         self._diagnostics.report(Health(told, self._summary(), values, hardware_id))
         self.age = None
 
-    def remark(self, kind: str, text: str) -> None:
-        """Log a remark, unless the last one of its kind was the same; "": there is none any more."""
-        if text and text != self._remarks.get(kind):
-            self._logger.warning(text)
-        self._remarks[kind] = text
+    def report_warning(self) -> None:
+        """Publish the diagnostics now, unless the last report was one of a problem."""
+        if self._diagnostics.level < WARN:
+            self.report()
+
+    def reject(self, error: RejectedError) -> None:
+        """Report the rejection of a message, which the controller has counted already."""
+        self.last_rejection = error.cause, str(error)
+        self.report_warning()
 
     def start_window(self) -> None:
         """Start a new reporting period."""
-        self._window, self._window_start = self._controller.counts.copy(), time.perf_counter()
-        trajectory = self._controller.trajectory
-        self._points_before = trajectory.skipped, trajectory.crowded
+        self._before, self._begun = self._counts().copy(), time.perf_counter()
         self._beyond_before = {axis.name for axis in self._controller.axes if axis.path.beyond}
         self.timing.restart()
         self.lateness.restart()
+
+    def _counts(self) -> Counts:
+        counts, trajectory = self._controller.counts, self._controller.trajectory
+        counts["points_skipped"], counts["points_crowded"] = trajectory.skipped, trajectory.crowded
+        return counts
+
+    def _since(self, name: str) -> int:
+        """Return what was counted since the last periodic report."""
+        return self._counts()[name] - self._before[name]
 
     def note_out_of_reach(self) -> None:
         """Keep which displacements cannot be reached now, and what to do."""
@@ -116,18 +149,6 @@ class Reporter:
                 "voltage_max if they are narrower than the model"
             )
         self._out_of_reach = f"desired displacement out of reach: {', '.join(out)}; {remedy}"
-
-    def _log(self, problems: Iterable[Problem]) -> None:
-        now, present = time.monotonic(), {each.kind: each for each in problems if each.kind}
-        for kind, (_, level, text) in present.items():
-            if kind not in self._present and now - self._logged.get(kind, -math.inf) >= LOG_PERIOD:
-                # Not in one line: a call of the logger keeps its severity.
-                if level == ERROR:
-                    self._logger.error(text)
-                else:
-                    self._logger.warning(text)
-                self._logged[kind] = now
-        self._present = present.keys()
 
     @property
     def _state(self) -> str:
@@ -167,7 +188,7 @@ class Reporter:
     def _late(self) -> str:
         """Return what a trajectory lost since the last periodic report, and why; "" if nothing."""
         trajectory, report = self._controller.trajectory, self.lateness.report()
-        skipped, crowded = trajectory.skipped - self._points_before[0], trajectory.crowded - self._points_before[1]
+        skipped, crowded = self._since("points_skipped"), self._since("points_crowded")
         points = "1 point" if skipped == 1 else f"{skipped} points"
         said = f"{points} of a trajectory skipped, as the next one was already due"
         if 2 * crowded > skipped:
@@ -183,42 +204,24 @@ class Reporter:
         )
 
     def _counters(self) -> dict[str, object]:
-        counts = self._controller.counts
+        counts, stopped = self._counts(), self._controller.stopped
         return {
             "state": self._state,
-            "received": counts.received,
-            "accepted": counts.accepted,
-            "rejected": counts.rejected,
-            **{f"rejected.{cause}": count for cause, count in counts.by_cause.items()},
-            "measurements_rejected": counts.measurements_rejected,
-            **{f"measurements_rejected.{cause}": count for cause, count in counts.measured_by_cause.items()},
+            **{name: counts[name] for name in COUNTED},
             "last_rejection": self.last_rejection[1],
-            "held_at_limit": counts.held_at_limit,
-            "excursions": counts.excursions,
-            "slew_limited": counts.slew_limited,
-            "trajectories": counts.trajectories,
-            "messages_lost": counts.lost,
-            "worked_off": counts.worked_off,
-            "largest_backlog": counts.largest_backlog,
             "age_of_answered_ms": f"{self.age * 1e3:.3f}" if self.age is not None else "",
-            "stopped": self._controller.stopped.value if self._controller.stopped else "",
-            "trajectories_rejected": counts.trajectories_rejected,
             "points_remaining": self._controller.trajectory.remaining,
-            "points_skipped": self._controller.trajectory.skipped,
-            "points_held_at_limit": counts.points_held,
-            "points_slew_limited": counts.points_slewing,
-            "gaps": counts.gaps,
-            "time_jumps": counts.time_jumps,
+            "stopped": stopped.value if stopped else "",
             "memory": self._memory(),
         }
 
     def _timing_values(self) -> dict[str, object]:
-        elapsed = max(time.perf_counter() - self._window_start, 1e-3)
+        elapsed = max(time.perf_counter() - self._begun, 1e-3)
         timing = self.timing.report()
         p50, p99, longest = _microseconds(timing)
         late_p50, late_p99, latest = _microseconds(self.lateness.report())
         return {
-            "rate_hz": f"{(self._controller.counts.received - self._window.received) / elapsed:.1f}",
+            "rate_hz": f"{self._since('received') / elapsed:.1f}",
             "jitter_ms": f"{timing.jitter * 1e3:.3f}" if timing else "",
             "latency_p50_us": p50,
             "latency_p99_us": p99,
@@ -236,35 +239,30 @@ class Reporter:
             "model.age_h": _hours_since(model.created) if model else "",
             "model.hardware_id": model.hardware_id if model else "",
             "model.kind": ", ".join(kinds),
-            "models_refused": self._controller.counts.models_refused,
             "last_model_error": self.model_error,
         }
 
     def _problems(self, settings: CompensatorSettings) -> Iterator[Problem]:
         """Yield all problems: those that are present, and what was counted since the last periodic report."""
-        controller, counts, window = self._controller, self._controller.counts, self._window
+        controller, since = self._controller, self._since
         ready, active, (cause, reason) = controller.model is not None, controller.active, self.last_rejection
         if self.model_error:
             yield Problem("model", WARN if ready else ERROR, f"model refused: {self.model_error}")
         if active and not ready:
             yield Problem("", WARN, "waiting for a model")
-        for what, now, before in (
-            ("messages", counts.rejected, window.rejected),
-            ("trajectories", counts.trajectories_rejected, window.trajectories_rejected),
-            ("measurements", counts.measurements_rejected, window.measurements_rejected),
-        ):
-            if now > before:
-                yield Problem(f"{what} {cause}", WARN, f"{now - before} {what} rejected, the last: {reason}")
-        if held := counts.held_at_limit - window.held_at_limit:
+        for what in ("messages", "trajectories", "measurements"):
+            if count := since("rejected" if what == "messages" else f"{what}_rejected"):
+                yield Problem(f"{what} {cause}", WARN, f"{count} {what} rejected, the last: {reason}")
+        if held := since("held_at_limit"):
             yield Problem("held", WARN, f"{held} times held at a voltage limit: {self._out_of_reach}")
-        if jumps := counts.time_jumps - window.time_jumps:
+        if jumps := since("time_jumps"):
             yield Problem("", WARN, f"the clock of the stamps was set back {jumps} times")
-        if points := counts.points_held - window.points_held:
+        if points := since("points_held_at_limit"):
             said = f"{points} points of a trajectory held at a voltage limit: {self._out_of_reach}"
             yield Problem("held", WARN, said)
         if late := self._late():
             yield Problem("late", WARN, late)
-        if lost := counts.lost - window.lost:
+        if lost := since("messages_lost"):
             yield Problem("", WARN, f"{lost} messages lost by the middleware; send fewer, or make its queue deeper")
         if ready and active:
             yield from self._ownership_problems()
@@ -279,7 +277,7 @@ class Reporter:
         if silence := self._silence():
             yield Problem("", WARN, silence)
         for axis in controller.axes if ready else ():
-            beyond, moving = axis.path.beyond, counts.accepted > window.accepted
+            beyond, moving = axis.path.beyond, since("accepted") > 0
             if beyond and axis.name not in self._beyond_before:
                 advice = "errors may be larger than told, record at that rate (slpi excite --for-path)"
                 yield Problem(f"{axis.name} beyond", WARN, f"axis '{axis.name}': {beyond}; {advice}")

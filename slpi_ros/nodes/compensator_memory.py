@@ -4,6 +4,7 @@ import time
 from collections.abc import Mapping
 
 from rclpy.node import Node
+from std_srvs.srv import Trigger
 
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Controller, OperatingMode
@@ -32,6 +33,7 @@ class Memory:
         self._file, self._kept = MemoryFile(path), path != ""
         self.waits = False  # for the voltages at the start, before it begins
         self._service = DeferredService(node, "~/reset_memory", self._on_reset)
+        node.create_service(Trigger, "~/set_zero", self._on_set_zero)
 
     # The file
 
@@ -85,9 +87,31 @@ class Memory:
             return
         said = "; ".join(f"axis '{axis.name}' {_assumed(axis)}" for axis in unsure)
         advice = f"call {self._node.get_fully_qualified_name()}/reset_memory (~/reset_memory) to reset it"
-        self._reporter.remark("assumed", f"the memory is assumed: {said}; {advice}, or set reset_on_start")
+        self._reporter.log.remark("assumed", f"the memory is assumed: {said}; {advice}, or set reset_on_start")
 
-    # Resets
+    # Zeros and resets
+
+    def _on_set_zero(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        """Let the zeros of the models agree with the sensors; nothing moves."""
+        try:
+            moved = self._controller.set_zero(time.monotonic_ns())
+        except SlpiError as error:
+            response.success, response.message = False, f"not set: {error}"
+            return response
+        said = [
+            f"axis '{name}': the zero moves by {offset * 1e6:+.4f} µm"
+            if offset is not None
+            else f"axis '{name}': not set, no measured_displacement in the last 0.2 s; remap it to that of the sensor"
+            for name, offset in moved.items()
+        ]
+        unsure = [axis.name for axis in self._controller.axes if axis.confidence.state not in (KNOWN, RESTORED)]
+        if unsure:
+            said.append(f"the memory of axis {', '.join(unsure)} is assumed: reset it, then set the zero again")
+        response.success, response.message = None not in moved.values(), "; ".join(said)
+        self._node.get_logger().info(f"~/set_zero: {response.message}")
+        self.save(complete=False)
+        self._reporter.report()
+        return response
 
     def _on_reset(self) -> str:
         """Start a reset unless one is running; return the reason if this is not possible, else ""."""

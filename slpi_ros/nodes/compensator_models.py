@@ -53,7 +53,7 @@ class Models:
 
     def refuse(self, error: SlpiError) -> None:
         """Tell that a model is refused."""
-        self._controller.counts.models_refused += 1
+        self._controller.counts["models_refused"] += 1
         self._reporter.model_error = str(error)
         self._reporter.report()
 

@@ -84,7 +84,7 @@ class Output:
         """Publish where the axes are and how uncertain that is, if anybody listens; else it is not computed."""
         wanted, axes = self._uncertainties.get_subscription_count() > 0, self._controller.axes
         why = watch_uncertainty(axes, self._controller.model, wanted, datetime.now(UTC), time.monotonic_ns())
-        self._reporter.remark("uncertainty", f"displacement_uncertainty is not published: {why}" if why else "")
+        self._reporter.log.remark("uncertainty", f"displacement_uncertainty is not published: {why}" if why else "")
         known = [(axis, spread) for axis in axes if (spread := axis.uncertainty.present) is not None]
         if why or not known:
             return

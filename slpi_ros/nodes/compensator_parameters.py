@@ -3,7 +3,7 @@
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
-from math import inf, nan
+from math import nan
 from typing import Any
 
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
@@ -13,73 +13,43 @@ from slpi_ros.compensator.validation import TimestampRules
 from slpi_ros.errors import UsageError
 from slpi_ros.model.axis_model import START_MEMORIES
 from slpi_ros.model.limits import Limits
-from slpi_ros.nodes.parameters import Declaration, Values, validated
+from slpi_ros.nodes import parameters as declare
+from slpi_ros.nodes.parameters import Declaration, Values, limits_of, validated
 
-VOLTAGE = (-10_000.0, 10_000.0)
-RATE = (0.0, 1e9)
 POSITIVE_RATE = (1e-3, 1e9)
-ACCELERATION = (0.0, 1e12)
 TIMEOUT = (0.0, 86_400.0)
 GAIN = (0.0, 1e15)
 HOLD_OR_SAFE = ("hold", "safe")
-# Default slew limit: the voltage range in this time, seconds. Default correction limit: this share of the range.
-DEFAULT_CROSSING, DEFAULT_CORRECTION = 0.1, 0.2
-
-
-def each_axis(name: str, default: float, description: str, between: tuple[float, float]) -> Declaration:
-    """Declare a numeric parameter that may have one value for each axis."""
-    text = f"{description} One value, or one for each axis."
-    return Declaration(name, default, text, between=between, number=True, each_axis=True)
-
-
-def scalar(
-    name: str, default: float, description: str, between: tuple[float, float], read_only: bool = False
-) -> Declaration:
-    """Declare a numeric parameter with a single value."""
-    return Declaration(name, default, description, read_only, between, number=True)
-
-
-def text(name: str, default: str, description: str, *choices: str, read_only: bool = False) -> Declaration:
-    """Declare a string parameter, limited to `choices` if any are given."""
-    return Declaration(name, default, description, read_only, choices=choices)
-
+# Default correction limit: this share of the voltage range.
+DEFAULT_CORRECTION = 0.2
 
 DECLARATIONS = (
-    Declaration(
-        "axes", ["x"], "Names of the axes; voltage_command holds their voltages in this order.", read_only=True
-    ),
-    text(
+    declare.AXES,
+    declare.text(
         "model_file", "",
         "Model document to load; empty: wait for stage_model. A change takes effect at the next configure.",
     ),
-    text(
+    declare.text(
         "hardware_id", "", "Hardware id of the stage; other models are refused. Empty: any model is accepted.",
         read_only=True,
     ),
-    text(
+    declare.text(
         "model_sha256", "",
         "SHA-256 of the only model document that is accepted, 64 hexadecimal digits: `sha256sum MODEL.json`. "
         "Empty: any.",
         read_only=True,
     ),
     # Limits
-    each_axis("voltage_min", 0.0, "Lower voltage limit, volts.", VOLTAGE),
-    each_axis("voltage_max", 100.0, "Upper voltage limit, volts.", VOLTAGE),
-    each_axis(
-        "slew_limit", nan, "Maximum rate of a voltage, V/s; NaN: the voltage range in 0.1 s. 0: no limit.", RATE,
-    ),
-    each_axis(
-        "acceleration_limit", 0.0, "Maximum change of the rate, V/s^2; 0: no limit.",
-        ACCELERATION,
-    ),
-    scalar(
+    *declare.voltage_limits(low=0.0, high=100.0),
+    declare.ACCELERATION_LIMIT,
+    declare.scalar(
         "output_rate", 1000.0,
         "Voltages per second while a trajectory, a ramp, a hold or what the limits held back is output, hertz. In one "
         "step a voltage changes by at most two periods of the slew limit.",
         (1.0, 20_000.0),
     ),
     # Start
-    text(
+    declare.text(
         "start_voltage", "auto",
         "Where the first voltage starts from: auto (as stage_state reports in effort; without a publisher of it as "
         "saved, else as the record of the model ended), measured (as reported, and nothing before), saved (as saved or "
@@ -92,50 +62,52 @@ DECLARATIONS = (
         "steady; if false, ~/arm does that.",
     ),
     # Trajectories
-    text(
+    declare.text(
         "trajectory_output", "stream",
         "stream: a trajectory is output sample by sample. block: as voltages in one message on voltage_trajectory, for "
         "a driver that plays it by the device's clock.",
         "stream", "block", read_only=True,
     ),
     # Commands
-    text(
+    declare.text(
         "desired_type", "JointState",
         "Type of desired_displacement, metres: JointState (axes by name), Float64 (for one axis) or Float64MultiArray "
         "(in the order of axes).",
         "JointState", "Float64", "Float64MultiArray", read_only=True,
     ),
-    scalar(
+    declare.scalar(
         "time_jump", 1.0,
         "Seconds. A stamp older than the last one by at most this is rejected as late; by more, the clock was set back "
         "and time restarts. Newer by more is counted as a gap.",
         (1e-3, 86_400.0),
     ),
-    scalar("max_age", 0.0, "Seconds; a message stamped longer ago is rejected as stale. 0: no check.", TIMEOUT),
-    scalar(
+    declare.scalar("max_age", 0.0, "Seconds; a message stamped longer ago is rejected as stale. 0: no check.", TIMEOUT),
+    declare.scalar(
         "command_timeout", 0.0,
         "Watchdog, seconds without an accepted command until on_timeout applies and /diagnostics warns. 0: disabled.",
         TIMEOUT,
     ),
     # Safe voltages
-    text(
+    declare.text(
         "on_timeout", "hold", "At command_timeout: hold the voltage, or ramp to safe_voltage (hold or safe).",
         *HOLD_OR_SAFE,
     ),
-    text(
+    declare.text(
         "on_deactivate", "hold",
         "At deactivation or shutdown: hold the voltage, or first ramp to safe_voltage (hold or safe).",
         *HOLD_OR_SAFE,
     ),
-    each_axis("safe_voltage", 0.0, "Safe voltage, volts.", VOLTAGE),
-    scalar("ramp_rate", 50.0, "Rate of the ramp to safe_voltage, V/s, at most 80 % of slew_limit.", POSITIVE_RATE),
+    declare.each_axis("safe_voltage", 0.0, "Safe voltage, volts.", declare.VOLTAGE),
+    declare.scalar(
+        "ramp_rate", 50.0, "Rate of the ramp to safe_voltage, V/s, at most 80 % of slew_limit.", POSITIVE_RATE,
+    ),
     Declaration(
         "surroundings", [""],
         "Topics, topic:field, of the recorded quantities that the stage follows (temperature, load); empty: as the "
         "model names them. Others than the model's are taken in its order.",
     ),
     # Memory
-    text(
+    declare.text(
         "start_memory", "end",
         "Initial state: that at the end of the model's record, at the start of the record, or after a reset (end, "
         "start or wiped). A memory_file takes precedence.",
@@ -148,68 +120,67 @@ DECLARATIONS = (
         "reset_cycles", 10, "Cycles of the decaying oscillation of reset_memory, from full range to none.",
         between=(1, 1000),
     ),
-    scalar(
+    declare.scalar(
         "reset_rate", 200.0, "Voltage rate of reset_memory, V/s, at most 80 % of slew_limit.", POSITIVE_RATE
     ),
-    each_axis("reset_min", nan, "Lowest voltage of reset_memory, volts; NaN: voltage_min.", VOLTAGE),
-    each_axis("reset_max", nan, "Highest voltage of reset_memory, volts; NaN: voltage_max.", VOLTAGE),
-    text(
+    declare.each_axis("reset_min", nan, "Lowest voltage of reset_memory, volts; NaN: voltage_min.", declare.VOLTAGE),
+    declare.each_axis("reset_max", nan, "Highest voltage of reset_memory, volts; NaN: voltage_max.", declare.VOLTAGE),
+    declare.text(
         "reset_to", "present", "Final voltage of reset_memory: present (before the reset) or safe (safe_voltage).",
         "present", "safe",
     ),
-    text("memory_file", "", "File that stores the memory for the next start; empty: none.", read_only=True),
+    declare.text("memory_file", "", "File that stores the memory for the next start; empty: none.", read_only=True),
     # Feedback
     Declaration("feedback", False, "Whether PID feedback of measured_displacement corrects the voltage."),
-    each_axis("kp", 0.0, "Proportional gain of the feedback, V/m.", GAIN),
-    each_axis("ki", 0.0, "Integral gain of the feedback, V/(m s).", GAIN),
-    each_axis("kd", 0.0, "Derivative gain of the feedback, V s/m, on the measured displacement.", GAIN),
-    each_axis(
+    declare.each_axis("kp", 0.0, "Proportional gain of the feedback, V/m.", GAIN),
+    declare.each_axis("ki", 0.0, "Integral gain of the feedback, V/(m s).", GAIN),
+    declare.each_axis("kd", 0.0, "Derivative gain of the feedback, V s/m, on the measured displacement.", GAIN),
+    declare.each_axis(
         "derivative_filter", 0.0, "Time constant of the derivative low-pass, seconds; 0: none.", (0.0, 1e3)
     ),
-    each_axis(
+    declare.each_axis(
         "correction_limit", nan,
         "Largest voltage that the feedback adds or subtracts, volts; NaN: a fifth of the voltage range.",
         (0.0, 20_000.0),
     ),
-    scalar(
+    declare.scalar(
         "feedback_fault_time", 0.5,
         "Seconds for which a sensor is silent, stuck, inverted or noisy before the feedback is switched off; 0: never.",
         TIMEOUT,
     ),
-    scalar("measurement_timeout", 0.1, "Seconds; older measurements are ignored and the correction is held.", TIMEOUT),
-    scalar(
+    declare.scalar(
+        "measurement_timeout", 0.1, "Seconds; older measurements are ignored and the correction is held.", TIMEOUT,
+    ),
+    declare.scalar(
         "drift_alarm", 3.0,
         "/diagnostics warns if the rms of measured - model exceeds this many times the held-out error; 0: never.",
         (0.0, 1e6),
     ),
     # Learning
-    text(
+    declare.text(
         "learn", "off",
         "Whether a desired_trajectory that comes again is corrected by what its passes measured: off, on, or hold "
         "(what was learned is used, and no more is learned). Kept in files beside memory_file.",
         "off", "on", "hold",
     ),
-    scalar(
+    declare.scalar(
         "learn_period", 0.0,
         "Period of the axes that repeat within a trajectory, seconds: each period is a pass (the fast axis of a "
         "raster, while the slow one moves on). 0: a trajectory is one pass.",
         TIMEOUT,
     ),
-    each_axis(
+    declare.each_axis(
         "learn_limit", nan,
         "Most that learning adds to a desired displacement, metres; NaN: a quarter of the stroke.", (1e-12, 1.0),
     ),
     # The node
     Declaration("autostart", True, "Whether the node configures and activates itself.", read_only=True),
-    text(
+    declare.text(
         "executor", "events", "Executor of the node: events (fast) or default (available in every rclpy).",
         "events", "default", read_only=True,
     ),
-    scalar("diagnostic_period", 1.0, "Period of /diagnostics, seconds.", (0.05, 3600.0), read_only=True),
-    Declaration(
-        "realtime_priority", 0, "SCHED_FIFO priority, 1 to 99, if the system permits; 0: normal scheduling.",
-        read_only=True, between=(0, 99),
-    ),
+    declare.DIAGNOSTIC_PERIOD,
+    declare.REALTIME_PRIORITY,
 )  # fmt: skip
 
 
@@ -242,7 +213,7 @@ class CompensatorSettings:
             )
         gains = zip(values["kp"], values["ki"], values["kd"], values["derivative_filter"], strict=True)
         timeout = values["measurement_timeout"]
-        limits = _limits(values)
+        limits = limits_of(values)
         ranges = [each.upper - each.lower for each in limits]
         corrections = values["correction_limit"] or [DEFAULT_CORRECTION * width for width in ranges]
         settings = cls(
@@ -279,46 +250,30 @@ class CompensatorSettings:
                 )
 
 
-def _limits(values: Mapping[str, Any]) -> tuple[Limits, ...]:
-    """Return the limits of each axis; UsageError if voltage_min is not below voltage_max."""
-    for name, low, high in zip(values["axes"], values["voltage_min"], values["voltage_max"], strict=True):
-        if not low < high:
-            raise UsageError(
-                f"axis '{name}': voltage_min {low:g} V is not below voltage_max {high:g} V; correct one of the two"
-            )
-    slew = values["slew_limit"] or [
-        (high - low) / DEFAULT_CROSSING for low, high in zip(values["voltage_min"], values["voltage_max"], strict=True)
-    ]
-    each = (values["voltage_min"], values["voltage_max"], slew, values["acceleration_limit"])
-    return tuple(
-        Limits(low, high, slew or inf, acceleration or inf) for low, high, slew, acceleration in zip(*each, strict=True)
-    )
-
-
 def _starts(values: Mapping[str, Any]) -> tuple[str | float, ...]:
     """Return the start voltage of each axis; UsageError if it is neither a word of `STARTS` nor a voltage in limits."""
     given, axes = values["start_voltage"], values["axes"]
     words = [each.strip() for each in given.split(",")]
     words *= len(axes) if len(words) == 1 else 1
-    starts: list[str | float] = []
-    for word in words:
-        if word not in STARTS:
-            try:
-                starts.append(float(word))
-            except ValueError:
-                starts.append(nan)
-        else:
-            starts.append(word)
+    starts = [_start(word) for word in words]
     limits = zip(values["voltage_min"], values["voltage_max"], strict=True)
-    within = [
-        not isinstance(each, float) or low <= each <= high for each, (low, high) in zip(starts, limits, strict=False)
-    ]
+    within = [isinstance(each, str) or low <= each <= high for each, (low, high) in zip(starts, limits, strict=False)]
     if len(starts) != len(axes) or not all(within):
         raise UsageError(
             f"parameter start_voltage is {given!r}; give {', '.join(STARTS)} or a voltage within the limits, or one of "
             f"these for each of the axes {', '.join(axes)}, separated by commas"
         )
     return tuple(starts)
+
+
+def _start(word: str) -> str | float:
+    """Return a word of `STARTS`, or the voltage (V) that it names; NaN if it is neither."""
+    if word in STARTS:
+        return word
+    try:
+        return float(word)
+    except ValueError:
+        return nan
 
 
 def _reset_spans(values: Mapping[str, Any], limits: tuple[Limits, ...]) -> tuple[tuple[float, float], ...]:

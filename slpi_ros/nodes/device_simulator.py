@@ -5,36 +5,29 @@ from functools import partial
 from rclpy.node import Node
 
 from slpi_ros.errors import UsageError
+from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, validated
 from slpi_ros.simulation.devices.base import FAULTS, Fault, SimulatedDevice
 from slpi_ros.simulation.devices.registry import SIMULATORS, make_simulator
 
-VOLTAGE = (-10_000.0, 10_000.0)
 NO_FAULT = "none"
 WITH_SERVO = ("gcs", "nv200")
 DECLARATIONS = (
-    Declaration("device", "gcs", "Kind of the device.", read_only=True, choices=tuple(SIMULATORS)),
-    Declaration("address", "", "Where to serve, as for the driver; empty: where the kind usually is.", read_only=True),
-    Declaration(
-        "channels", [""],
-        "The device's names of its axes, as for the driver; empty: the first one of the kind.",
-        read_only=True,
+    *declare.read_only(
+        declare.text("device", "gcs", "Kind of the device.", *SIMULATORS),
+        declare.text("address", "", "Where to serve, as for the driver; empty: where the kind usually is."),
+        Declaration(
+            "channels", [""], "The device's names of its axes, as for the driver; empty: the first one of the kind."
+        ),
+        declare.SEED,
+        declare.scalar("noise_rms", 8e-9, "Sensor noise, metres rms.", (0.0, 1.0)),
+        declare.scalar("voltage", 0.0, "Voltage at the outputs at the start, volts of the device.", declare.VOLTAGE),
+        Declaration("servo", False, f"{', '.join(WITH_SERVO)}: whether the servo is on at the start."),
+        declare.scalar("answer_delay", 0.0003, "Time until an answer, seconds.", (0.0, 10.0)),
     ),
-    Declaration("seed", 0, "Seed of the random stage and of the noise.", read_only=True, between=(0, 2**53)),
-    Declaration(
-        "noise_rms", 8e-9, "Sensor noise, metres rms.", read_only=True, between=(0.0, 1.0), number=True
-    ),
-    Declaration(
-        "voltage", 0.0, "Voltage at the outputs at the start, volts of the device.", read_only=True, between=VOLTAGE,
-        number=True,
-    ),
-    Declaration("servo", False, f"{', '.join(WITH_SERVO)}: whether the servo is on at the start.", read_only=True),
-    Declaration(
-        "answer_delay", 0.0003, "Time until an answer, seconds.", read_only=True, between=(0.0, 10.0), number=True
-    ),
-    Declaration(
+    declare.text(
         "fault", NO_FAULT, "What goes wrong with the next reading of the position, once each time it is set.",
-        choices=(NO_FAULT, *FAULTS),
+        NO_FAULT, *FAULTS,
     ),
 )  # fmt: skip
 

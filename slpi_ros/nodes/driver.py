@@ -1,6 +1,5 @@
 """Node ``driver``: a real amplifier and sensor on the topics of a stage."""
 
-import math
 import threading
 import time
 from dataclasses import dataclass
@@ -19,9 +18,9 @@ from trajectory_msgs.msg import JointTrajectory
 from slpi_ros.drivers.base import Channel, Reading
 from slpi_ros.drivers.registry import MODULES, make_device
 from slpi_ros.errors import SlpiError, UsageError, shown
-from slpi_ros.excitation.drives import slew_limits
 from slpi_ros.io.messages import SECOND_NS, JointStateEncoder, decode_trajectory, encode_trajectory
-from slpi_ros.model.limits import Limits, volts
+from slpi_ros.model.limits import volts
+from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.common import (
     COMMANDS,
     ERROR,
@@ -36,9 +35,8 @@ from slpi_ros.nodes.common import (
 )
 from slpi_ros.nodes.device_block import BlockPlayer, BlockRequest, BlockState, Told
 from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings, State
-from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
+from slpi_ros.nodes.parameters import Declaration, Parameters, Values, limits_of, validated
 
-VOLTAGE = (-10_000.0, 10_000.0)
 HOLD, REST = "hold", "rest"
 # Period of diagnostics, and of looks at what the thread of the device has done, seconds.
 REPORT_PERIOD, LOOK_PERIOD, LOG_PERIOD = 0.5, 0.05, 5.0
@@ -47,74 +45,37 @@ LATE_SHARE = 0.02
 # Characters of a device's own identity in messages.
 LONGEST_IDENTITY = 100
 
-DECLARATIONS = (
-    Declaration(
-        "device", "", f"Kind of the device: {', '.join(MODULES)}; required.", read_only=True, choices=tuple(MODULES)
+DECLARATIONS = declare.read_only(
+    declare.text("device", "", f"Kind of the device: {', '.join(MODULES)}; required.", *MODULES),
+    declare.text(
+        "address", "", "Where the device is: host or host:port, a serial port, or DIALECT:PORT of a serial device."
     ),
-    Declaration(
-        "address", "", "Where the device is: host or host:port, a serial port, or DIALECT:PORT of a serial device.",
-        read_only=True,
+    declare.AXES,
+    Declaration("channels", ["1"], "The device's name of each axis, in the order of axes."),
+    *declare.voltage_limits(),
+    declare.scalar("rate", 1000.0, "Cycles per second: one writing and one reading, hertz.", (1.0, 10_000.0)),
+    declare.each_axis(
+        "amplifier_gain", 1.0, "Voltage at the stage for one volt of the device, V/V: of an amplifier behind it.",
+        (1e-6, 1e6),
     ),
-    Declaration("axes", ["x"], "Names of the axes, in the order of voltage_command.", read_only=True),
-    Declaration("channels", ["1"], "The device's name of each axis, in the order of axes.", read_only=True),
-    Declaration(
-        "voltage_min", math.nan, "Lower voltage limit, volts; required. One value, or one for each axis.",
-        read_only=True, number=True,
-    ),
-    Declaration(
-        "voltage_max", math.nan, "Upper voltage limit, volts; required. One value, or one for each axis.",
-        read_only=True, number=True,
-    ),
-    Declaration(
-        "slew_limit", math.nan,
-        "Maximum rate of a voltage, V/s; NaN: the voltage range in 0.1 s. 0: no limit. One value, or one for each "
-        "axis.",
-        read_only=True, between=(0.0, 1e9), number=True, each_axis=True,
-    ),
-    Declaration(
-        "rate", 1000.0, "Cycles per second: one writing and one reading, hertz.",
-        read_only=True, between=(1.0, 10_000.0), number=True,
-    ),
-    Declaration(
-        "amplifier_gain", 1.0,
-        "Voltage at the stage for one volt of the device, V/V: of an amplifier behind it. One value, or one for each "
-        "axis.",
-        read_only=True, between=(1e-6, 1e6), number=True, each_axis=True,
-    ),
-    Declaration(
+    declare.each_axis(
         "sensor_scale", 1e-6,
-        "Displacement for one unit of the device's position, metres; negative where they count against each other. One "
-        "value, or one for each axis.",
-        read_only=True, between=(-1.0, 1.0), number=True, each_axis=True,
+        "Displacement for one unit of the device's position, metres; negative where they count against each other.",
+        (-1.0, 1.0),
     ),
-    Declaration(
-        "sensor_offset", 0.0, "Added to the displacement, metres. One value, or one for each axis.",
-        read_only=True, between=(-1.0, 1.0), number=True, each_axis=True,
-    ),
+    declare.each_axis("sensor_offset", 0.0, "Added to the displacement, metres.", (-1.0, 1.0)),
     Declaration(
         "take_over_servo", False,
-        "Whether to switch off a servo that is on at the device, which may move the stage a little.", read_only=True,
+        "Whether to switch off a servo that is on at the device, which may move the stage a little.",
     ),
-    Declaration(
-        "rearm", False, "Whether to go on by itself after a lost link; if false, nothing moves until ~/arm.",
-        read_only=True,
-    ),
-    Declaration(
+    Declaration("rearm", False, "Whether to go on by itself after a lost link; if false, nothing moves until ~/arm."),
+    declare.text(
         "at_exit", HOLD, "hold: the output stays as it is at the end. rest: it goes to rest_voltage at the slew limit.",
-        read_only=True, choices=(HOLD, REST),
+        HOLD, REST,
     ),
-    Declaration(
-        "rest_voltage", 0.0, "Voltage to go to at the end, volts. One value, or one for each axis.",
-        read_only=True, between=VOLTAGE, number=True, each_axis=True,
-    ),
-    Declaration(
-        "hardware_id", "", "Identifier of the stage in stage_state; empty: what the device says of itself.",
-        read_only=True,
-    ),
-    Declaration(
-        "realtime_priority", 0, "SCHED_FIFO priority, 1 to 99, if the system permits; 0: normal scheduling.",
-        read_only=True, between=(0, 99),
-    ),
+    declare.each_axis("rest_voltage", 0.0, "Voltage to go to at the end, volts.", declare.VOLTAGE),
+    declare.text("hardware_id", "", "Identifier of the stage in stage_state; empty: what the device says of itself."),
+    declare.REALTIME_PRIORITY,
 )  # fmt: skip
 
 
@@ -137,17 +98,7 @@ class DriverSettings:
             )
         if 0.0 in values["sensor_scale"]:
             raise UsageError("parameter sensor_scale is 0; give metres for one unit of the device's position")
-        low, high = (numbers(given, name, axes, *VOLTAGE) for name in ("voltage_min", "voltage_max"))
-        if swapped := [axis for axis, lowest, highest in zip(axes, low, high, strict=True) if lowest >= highest]:
-            at = axes.index(swapped[0])
-            raise UsageError(
-                f"axis '{swapped[0]}': voltage_min {low[at]:g} and voltage_max {high[at]:g} V; give voltage_min below "
-                "voltage_max"
-            )
-        slew = slew_limits(values["slew_limit"], low, high)
-        limits = tuple(
-            Limits(lowest, highest, rate or math.inf) for lowest, highest, rate in zip(low, high, slew, strict=True)
-        )
+        limits = limits_of(values)
         rest = values["rest_voltage"] if values["at_exit"] == REST else None
         if rest and any(each.clip(v) != v for each, v in zip(limits, rest, strict=True)):
             raise UsageError(f"parameter rest_voltage is {volts(*rest)} V; give it within voltage_min and voltage_max")

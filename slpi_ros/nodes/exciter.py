@@ -14,57 +14,37 @@ from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
 from slpi_ros.errors import RecordError, SlpiError, UsageError
-from slpi_ros.excitation.drives import DRIVES, SLEW_USED, Drive, Playback, excite, slew_limits
+from slpi_ros.excitation.drives import DRIVES, SLEW_USED, Drive, Playback, excite
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import Limits, volts
+from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.common import COMMANDS, request_stop
 from slpi_ros.nodes.guarded_drive import DELIVERY, GuardedDrive
-from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
+from slpi_ros.nodes.parameters import Declaration, Parameters, Values, limits_of, validated
 
-VOLTAGE = (-10_000.0, 10_000.0)
 LIVE = "live"
 
 DECLARATIONS = (
-    Declaration("axes", ["x"], "Names of the axes, in the order of voltage_command.", read_only=True),
-    Declaration(
-        "voltage_min", math.nan, "Lower voltage limit, volts; required. One value, or one for each axis.",
-        number=True,
-    ),
-    Declaration(
-        "voltage_max", math.nan, "Upper voltage limit, volts; required. One value, or one for each axis.",
-        number=True,
-    ),
-    Declaration(
-        "slew_limit", math.nan,
-        "Maximum rate of a voltage, V/s, of which the drive uses 80 %; NaN: the voltage range in 0.1 s. 0: no limit. "
-        "One value, or one for each axis.",
-        between=(0.0, 1e9), number=True, each_axis=True,
-    ),
-    Declaration(
+    declare.AXES,
+    *declare.voltage_limits(", of which the drive uses 80 %"),
+    declare.each_axis(
         "rest_voltage", math.nan,
         "Voltage before and after the excitation, volts; NaN: as reported by stage_state. Without a publisher of "
-        "stage_state the amplifier is taken to be there. One value, or one for each axis.",
-        number=True,
+        "stage_state the amplifier is taken to be there.",
+        declare.VOLTAGE,
     ),
-    Declaration(
-        "state_timeout", 0.5,
-        "Seconds without a valid stage_state after which the drive is given up; reports of the voltage may be as late.",
-        read_only=True, between=(1e-3, 60.0), number=True,
-    ),
-    Declaration("duration", 30.0, "Total excitation time of all axes, seconds.", between=(0.1, 86_400.0), number=True),
-    Declaration("rate", 200.0, "Sample rate, hertz.", between=(1.0, 10_000.0), number=True),
-    Declaration(
-        "settle", 3.0, "Seconds to wait for further subscribers after the first one.",
-        between=(0.0, 3600.0), number=True,
-    ),
-    Declaration("drive", DRIVES[0], f"Excitation drive: {', '.join(DRIVES)}.", choices=DRIVES),
+    declare.STATE_TIMEOUT,
+    declare.scalar("duration", 30.0, "Total excitation time of all axes, seconds.", (0.1, 86_400.0)),
+    declare.scalar("rate", 200.0, "Sample rate, hertz.", (1.0, 10_000.0)),
+    declare.scalar("settle", 3.0, "Seconds to wait for further subscribers after the first one.", (0.0, 3600.0)),
+    declare.text("drive", DRIVES[0], f"Excitation drive: {', '.join(DRIVES)}.", *DRIVES),
     Declaration("seed", 0, "Seed of the random parts of the excitation drive.", between=(0, 2**31 - 1)),
     Declaration("repeat", False, "Whether to repeat the excitation until stopped."),
-    Declaration(
+    declare.text(
         "output", LIVE,
         "live: samples on voltage_command at the sample rate. trajectory: all samples in one message on "
         "voltage_trajectory, for a device with its own timing.",
-        read_only=True, choices=(LIVE, "trajectory"),
+        LIVE, "trajectory", read_only=True,
     ),
     Declaration(
         "autostart", True, "Whether to start at once and exit at the end; if false, ~/start starts.", read_only=True
@@ -78,23 +58,16 @@ class ExciterSettings:
 
     values: Values  # all parameters by name
     limits: tuple[Limits, ...]
-    rest: list[float] | None  # V, before and after; None: as reported by ``stage_state``
+    rest: tuple[float, ...] | None  # V, before and after; None: as reported by ``stage_state``
 
     @classmethod
     def of(cls, given: Values) -> "ExciterSettings":
         """Return the settings from a mapping of parameter names to values."""
-        values, axes = validated(DECLARATIONS, given), given["axes"]
-        low, high = (numbers(given, name, axes, *VOLTAGE) for name in ("voltage_min", "voltage_max"))
-        rest = given["rest_voltage"]
-        rest = None if rest != rest else numbers(given, "rest_voltage", axes, *VOLTAGE)
+        values = validated(DECLARATIONS, given)
         if values["repeat"] and values["output"] != LIVE:
             raise UsageError(f"parameters repeat and output '{values['output']}' do not go together; set one of them")
-        slew = slew_limits(values["slew_limit"], low, high)
-        limits = tuple(
-            Limits(lowest, highest, rate or math.inf) for lowest, highest, rate in zip(low, high, slew, strict=True)
-        )
-        settings = cls(values, limits, rest)
-        settings.drawn(low)
+        settings = cls(values, limits_of(values), values["rest_voltage"])
+        settings.drawn(values["voltage_min"])
         return settings
 
     def drawn(self, found: Sequence[float]) -> Drive:

@@ -12,14 +12,14 @@ from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.document import parse_model
-from slpi_ros.nodes.common import LATCHED, START_ERRORS
+from slpi_ros.nodes.common import LATCHED, START_ERRORS, full_name, reliability_of
 from slpi_ros.nodes.parameters import numbers
 from slpi_ros.reports.doctor import STATE_TYPE, Graph
 
@@ -63,11 +63,8 @@ class _Probe:
         self._spin(DISCOVERY, lambda: bool(node.get_publishers_info_by_topic(self._state)))
         offers = node.get_publishers_info_by_topic(self._state)
         if offers and all(offer.topic_type == STATE_TYPE for offer in offers):
-            reliable = all(offer.qos_profile.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
-            reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-            node.create_subscription(
-                JointState, self._state, self._on_state, QoSProfile(depth=DEPTH, reliability=reliability)
-            )
+            qos = QoSProfile(depth=DEPTH, reliability=reliability_of(offers))
+            node.create_subscription(JointState, self._state, self._on_state, qos)
         self._spin(seconds)
         commanding = _ends(node.get_publishers_info_by_topic(self._command))
         last = self._last or JointState()
@@ -83,7 +80,7 @@ class _Probe:
             self._state,
             self._command,
             seconds,
-            [name for name in (_joined(space, name) for name, space in names) if name != own],
+            [name for name in (full_name(space, name) for name, space in names) if name != own],
             _ends(node.get_publishers_info_by_topic(self._state)),
             list(commanding),
             list(_ends(node.get_subscriptions_info_by_topic(self._command))),
@@ -119,27 +116,22 @@ class _Probe:
         answer = client.call_async(GetParameters.Request(names=list(ASKED)))
         self._spin(ANSWER, answer.done)
         values = [parameter_value_to_python(value) for value in answer.result().values] if answer.done() else []
-        given = dict(zip(ASKED, values, strict=False))
-        axes = given.get("axes")
-        if axes is None or any(given.get(limit) is None for limit in ASKED[1:]):
+        if len(values) < len(ASKED) or None in values:
             return {}
+        given = dict(zip(ASKED, values, strict=True))
         try:
-            low, high = (numbers(given, limit, axes, -math.inf, math.inf) for limit in ASKED[1:])
+            low, high = (numbers(given, limit, given["axes"], -math.inf, math.inf) for limit in ASKED[1:])
         except SlpiError:
             return {}
-        return {axis: (lowest, highest) for axis, lowest, highest in zip(axes, low, high, strict=True)}
+        return {axis: (lowest, highest) for axis, lowest, highest in zip(given["axes"], low, high, strict=True)}
 
 
 def _ends(infos: Sequence[Any]) -> dict[str, str]:
     """Return the type of each end of a topic by name; ends of one node are numbered."""
     ends: dict[str, str] = {}
     for info in infos:
-        name, number = _joined(info.node_namespace, info.node_name), 2
+        name, number = full_name(info.node_namespace, info.node_name), 2
         while name in ends:
-            name, number = f"{_joined(info.node_namespace, info.node_name)} ({number})", number + 1
+            name, number = f"{full_name(info.node_namespace, info.node_name)} ({number})", number + 1
         ends[name] = info.topic_type
     return ends
-
-
-def _joined(namespace: str, name: str) -> str:
-    return f"{namespace.rstrip('/')}/{name}"

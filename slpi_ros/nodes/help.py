@@ -8,7 +8,6 @@ import sys
 import textwrap
 from collections.abc import Iterator, Sequence
 from importlib.resources import files
-from typing import Any
 
 from rclpy.node import Node
 
@@ -32,7 +31,7 @@ def _lines(name: str, node: type[Node], declarations: Sequence[Declaration]) -> 
     for paragraph in _purpose(node):
         yield from (*textwrap.wrap(paragraph, width), "")
     yield "topics:"
-    for topic in _topics():
+    for topic in json.loads((files("slpi_ros") / "msg_schemas" / "topics.json").read_text(encoding="utf-8"))["topics"]:
         kinds = " or ".join(kind.replace("/msg/", "/") for kind in topic["types"])
         for role, direction in (("subscribers", "in"), ("publishers", "out")):
             if name in topic[role]:
@@ -50,12 +49,6 @@ def _purpose(node: type[Node]) -> list[str]:
     text = re.split(r"\n\n[A-Z]\w+\n---", inspect.getdoc(node) or "")[0]
     text = re.sub(r"[;,.]? parameters in `\w+`", "", text, flags=re.IGNORECASE)
     return [" ".join(paragraph.split()).replace("`", "") for paragraph in text.split("\n\n")]
-
-
-def _topics() -> list[dict[str, Any]]:
-    table = files("slpi_ros") / "msg_schemas" / "topics.json"
-    topics: list[dict[str, Any]] = json.loads(table.read_text(encoding="utf-8"))["topics"]
-    return topics
 
 
 def _entry(head: str, text: str, width: int) -> list[str]:

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from std_msgs.msg import String
 from std_srvs.srv import Trigger
@@ -22,7 +21,8 @@ from slpi_ros.io.outputs import allow_document
 from slpi_ros.model.document import parse_model, save_model
 from slpi_ros.model.sensor import LONGEST
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.nodes.common import ERROR, LATCHED, WARN, DeferredService, Diagnostics, Health
+from slpi_ros.nodes import parameters as declare
+from slpi_ros.nodes.common import ERROR, LATCHED, WARN, DeferredService, Diagnostics, Health, steady_timer
 from slpi_ros.nodes.jobs import (
     DiagnosisOutcome,
     DiagnosisRequest,
@@ -33,58 +33,55 @@ from slpi_ros.nodes.jobs import (
     fit,
     run_diagnosis,
 )
-from slpi_ros.nodes.parameters import Declaration, Parameters, Values, number, validated
+from slpi_ros.nodes.parameters import Declaration, Parameters, Values, validated
 
+ANY_TIME = (-math.inf, math.inf)
 DECLARATIONS = (
     Declaration(
         "bags", [""],
         "Bags to identify in one fit: rosbag2 folders, or single mcap or db3 files. A later change of a parameter "
         "repeats the identification.",
     ),
-    Declaration(
+    declare.text(
         "watch_directory", "",
         "Watched folder: the newest complete bag and every bag completed later are identified, unless recorded on "
         "another stage than the published model; empty: none.",
     ),
-    Declaration("topic", "stage_state", "Topic of the bag that holds voltage and displacement."),
+    declare.text("topic", "stage_state", "Topic of the bag that holds voltage and displacement."),
     Declaration(
         "surroundings", [""],
         "Recorded quantities that the stage may follow, topic or topic:field: the model compensates those that it "
         "follows; empty: none, and for ~/diagnose every one that the bag holds.",
     ),
-    Declaration("kind", "slpi", f"Kind of hysteresis model: {', '.join(KINDS)}.", choices=tuple(KINDS)),
-    Declaration("output", "", "File for the model document; empty: none."),
+    declare.text("kind", "slpi", f"Kind of hysteresis model: {', '.join(KINDS)}.", *KINDS),
+    declare.text("output", "", "File for the model document; empty: none."),
     Declaration(
         "replace", False,
         "Whether a new model is published whatever it lacks beside the model in use: voltage range, coverage, samples, "
         "held-out error.",
     ),
-    Declaration(
+    declare.scalar(
         "sensor_delay", 0.0, "Known delay of the sensor, seconds, taken out of its readings; the model keeps it.",
-        between=(0.0, LONGEST), number=True,
+        (0.0, LONGEST),
     ),
-    Declaration(
+    declare.scalar(
         "sensor_lag", 0.0,
         "Known time constant of the sensor's low-pass filter, seconds, taken out of its readings; the model keeps it.",
-        between=(0.0, LONGEST), number=True,
+        (0.0, LONGEST),
     ),
-    Declaration(
+    declare.scalar(
         "start", math.nan, "Start of the fitted part, seconds from the first stamp; NaN or negative: first stamp.",
-        number=True,
+        ANY_TIME,
     ),
-    Declaration(
-        "stop", math.nan, "End of the fitted part, seconds from the first stamp; NaN or negative: last stamp.",
-        number=True,
+    declare.scalar(
+        "stop", math.nan, "End of the fitted part, seconds from the first stamp; NaN or negative: last stamp.", ANY_TIME
     ),
-    Declaration(
+    declare.text(
         "diagnosis_directory", "",
         "Output folder of ~/diagnose; empty: NAME_diagnosis next to the output NAME.json, or, without an output, a "
         "temporary folder named in the service response.",
     ),
-    Declaration(
-        "diagnostic_period", 1.0, "Period of /diagnostics, seconds.",
-        read_only=True, between=(0.05, 3600.0), number=True,
-    ),
+    declare.DIAGNOSTIC_PERIOD,
 )  # fmt: skip
 
 
@@ -100,71 +97,50 @@ class IdentifySettings:
     @classmethod
     def of(cls, values: Values) -> "IdentifySettings":
         """Return the settings from parameter names and values; UsageError if a value is not valid."""
-        bags = tuple(bag for bag in values["bags"] if bag)
         if not values["topic"]:
             raise UsageError("parameter topic is empty; name the topic of the bag, as in stage_state")
         checked = validated(DECLARATIONS, values)
-        start, stop = bound(values, "start"), bound(values, "stop")
+        start, stop = (None if (time := checked[name]) is None or time < 0.0 else time for name in ("start", "stop"))
         if start is not None and stop is not None and not start < stop:
             raise UsageError(f"parameter start is {start:g} s and stop {stop:g} s; start before you stop")
+        output, folder = values["output"], values["watch_directory"]
         request = FitRequest(
-            bags,
+            tuple(bag for bag in values["bags"] if bag),
             values["topic"],
             values["kind"],
             start,
             stop,
-            values["output"],
+            output,
             unconditional=values["replace"],
             sensor_delay=checked["sensor_delay"],
             sensor_lag=checked["sensor_lag"],
             surroundings=tuple(topic for topic in values["surroundings"] if topic),
         )
-        folder = values["watch_directory"]
         if folder:
             BagWatch(folder)
-        diagnosis = values["diagnosis_directory"] or beside(request.output)
-        return cls(request, folder, diagnosis, checked["diagnostic_period"])
+        beside = f"{os.path.splitext(output)[0]}_diagnosis" if output else ""
+        return cls(request, folder, values["diagnosis_directory"] or beside, checked["diagnostic_period"])
 
 
-def beside(output: str) -> str:
-    """Return the diagnosis folder next to the model file `output`; "" without a file."""
-    return f"{os.path.splitext(output)[0]}_diagnosis" if output else ""
-
-
-def bound(values: Values, name: str) -> float | None:
-    """Return the parameter `name` as a time of the record, seconds; None if NaN or negative."""
-    given = values[name]
-    if isinstance(given, float) and math.isnan(given):
-        return None
-    seconds = number(values, name, -math.inf, math.inf)
-    return seconds if seconds >= 0 else None
-
-
-POLL_PERIOD = 0.1
+# Periods of looks at the processes and at the watched folder, seconds.
+POLL_PERIOD, WATCH_PERIOD = 0.1, 0.5
 NO_MODEL = "nothing to diagnose: no bag has been identified yet"
+NOTHING_TO_DO = "no bag to identify; set the parameter bags or watch_directory"
 
 
 class DiagnosisService:
     """Service ``~/diagnose``: find the causes of the model errors on the bags of the fit; respond when complete."""
 
     # The diagnosis only writes files, in `folder` ("": a temporary one); it does not change the published model.
-    # `identified` returns the request for that model and its bags; `report` is called at start and end of a diagnosis.
-    def __init__(
-        self,
-        node: Node,
-        identified: Callable[[], DiagnosisRequest | None],
-        folder: Callable[[], str],
-        report: Callable[[], None],
-    ) -> None:
-        self._logger = node.get_logger()
-        self._identified, self._folder, self._report = identified, folder, report
+    # `report` is called at start and end of a diagnosis.
+    def __init__(self, node: Node, folder: Callable[[], str], report: Callable[[], None]) -> None:
+        self._logger, self._folder, self._report = node.get_logger(), folder, report
+        self._published: DiagnosisRequest | None = None
         self._job: WorkerProcess[DiagnosisRequest, DiagnosisOutcome] | None = None
         self._last: DiagnosisRequest | None = None
         self._outcome = DiagnosisOutcome()
         self._temporary = ""
         self._service = DeferredService(node, "~/diagnose", self._start)
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._poll = node.create_timer(POLL_PERIOD, self._poll_job, clock=steady, autostart=False)
 
     @property
     def error(self) -> str:
@@ -174,7 +150,7 @@ class DiagnosisService:
     @property
     def activity(self) -> str:
         """Text that describes the running diagnosis; "" if none."""
-        return f"diagnosing {self._job.request.source} for {time.monotonic() - self._began:.0f} s" if self._job else ""
+        return f"diagnosing {self._job.request.source} for {self._job.seconds:.0f} s" if self._job else ""
 
     @property
     def values(self) -> dict[str, object]:
@@ -188,34 +164,51 @@ class DiagnosisService:
             **{f"{axis}.diagnosis": summary for axis, summary in self._outcome.summaries.items()},
         }
 
-    def forget(self) -> None:
-        """Discard the last result because another model has been published."""
+    def use(self, published: DiagnosisRequest) -> None:
+        """Diagnose another model from now on, which has been published, and discard the last result."""
+        self._published = published
         if not self._job:
             self._last, self._outcome = None, DiagnosisOutcome()
 
     def end(self) -> None:
         """Stop the running diagnosis, if any."""
-        self._poll.cancel()
         if self._job:
             self._job.end()
             self._job = None
+
+    def poll(self) -> None:
+        """Respond if the diagnosis is complete."""
+        outcome = self._job.outcome() if self._job else None
+        if not self._job or not outcome:
+            return
+        folder, self._job, self._outcome = Path(self._job.request.folder), None, outcome
+        said = outcome.error
+        if said:
+            self._logger.error(said)
+        else:
+            said = "; ".join(
+                f"{axis}: {verdict.replace('_', ' ')}: {outcome.summaries[axis]}"
+                for axis, verdict in outcome.verdicts.items()
+            )
+            said += f" Page: {folder / 'report.html'}; extended model, not in use: {folder / 'extended_model.json'}"
+            said = shown(said)
+            self._logger.info(said)
+        self._service.answer(not outcome.error, said)
+        self._report()
 
     def _start(self) -> str:
         """Start a diagnosis unless one is running; return the reason if this is not possible, else ""."""
         if self._job:
             return ""
-        identified = self._identified()
-        if not identified:
+        if not self._published:
             return NO_MODEL
         try:
             folder = os.path.abspath(self._folder() or self._temporary_folder())
-            request = replace(identified, folder=folder)
+            request = replace(self._published, folder=folder)
             self._job = WorkerProcess(run_diagnosis, request, DiagnosisOutcome, f"{request.source}: the diagnosis")
-            self._began = time.monotonic()
         except OSError as error:
             return f"no diagnosis can be started: {error}; free memory or disk, or set diagnosis_directory"
         self._last, self._outcome = request, DiagnosisOutcome()
-        self._poll.reset()
         self._report()
         return ""
 
@@ -223,34 +216,44 @@ class DiagnosisService:
         self._temporary = self._temporary or tempfile.mkdtemp(prefix="slpi_diagnosis_")
         return self._temporary
 
-    def _poll_job(self) -> None:
-        outcome = self._job.outcome() if self._job else None
-        if not self._job or not outcome:
-            return
-        folder, self._job, self._outcome = Path(self._job.request.folder), None, outcome
-        self._poll.cancel()
-        if outcome.error:
-            self._logger.error(outcome.error)
-            self._service.answer(False, outcome.error)
-        else:
-            said = "; ".join(
-                f"{axis}: {verdict.replace('_', ' ')}: {outcome.summaries[axis]}"
-                for axis, verdict in outcome.verdicts.items()
-            )
-            said += f" Page: {folder / 'report.html'}; extended model, not in use: {folder / 'extended_model.json'}"
-            self._logger.info(shown(said))
-            self._service.answer(True, shown(said))
-        self._report()
-
-
-WATCH_PERIOD = 0.5
-NOTHING_TO_DO = "no bag to identify; set the parameter bags or watch_directory"
 
 # Time from the start within which a model that somebody else has published is heard of, seconds: Fast DDS announces a
 # participant again after three seconds, if the first announcements were lost.
 DISCOVERY = 4.0
 # The same where there is another publisher: a latched message that was lost comes again after three more seconds.
 LATCHED_WITHIN = 7.0
+
+
+class ModelInUse:
+    """The model in use: the last `document` on ``stage_model``, by whomever; "" if there is none."""
+
+    def __init__(self, node: Node) -> None:
+        self.document = ""
+        self._node, self._begun = node, time.monotonic()
+        self._echoes: deque[str] = deque()  # messages of this node that will come back
+        self._publisher = node.create_publisher(String, "stage_model", LATCHED)
+        node.create_subscription(String, "stage_model", self._on_model, LATCHED)
+
+    @property
+    def known(self) -> bool:
+        """Whether a model that somebody else has published has been heard of, if there is one."""
+        others = not self.document and self._node.count_publishers("stage_model") > 1
+        return time.monotonic() - self._begun >= (LATCHED_WITHIN if others else DISCOVERY)
+
+    def publish(self, document: str) -> None:
+        """Publish a model, which is in use from now on."""
+        self.document = document
+        self._echoes.append(document)
+        self._publisher.publish(String(data=document))
+
+    def _on_model(self, message: String) -> None:
+        """Take note of a model that somebody else has published."""
+        document = str(message.data)
+        if document in self._echoes:
+            while self._echoes.popleft() != document:
+                pass
+        elif len(document) <= TOPIC_MODEL_CHARACTERS:
+            self.document = document
 
 
 class Identify(Node):
@@ -265,36 +268,27 @@ class Identify(Node):
 
     def __init__(self) -> None:
         super().__init__("identify")
-        self._parameter_set = Parameters(self, DECLARATIONS, IdentifySettings.of)
-        self._publisher = self.create_publisher(String, "stage_model", LATCHED)
-        # The model in use, and the messages of this node that will come back.
-        self._in_use, self._begun = "", time.monotonic()
-        self._echoes: deque[str] = deque()
-        self.create_subscription(String, "stage_model", self._on_model, LATCHED)
+        parameters = Parameters(self, DECLARATIONS, IdentifySettings.of)
+        self._settings = parameters.settings
+        self._in_use = ModelInUse(self)
         self._diagnostics = Diagnostics(self, "identify")
+        self._diagnosis = DiagnosisService(self, lambda: self._settings.diagnosis_directory, self._report)
         self._job: WorkerProcess[FitRequest, FitOutcome] | None = None
         self._asked: FitRequest | None = None
         self._waiting: deque[Path] = deque()
         self._watch: BagWatch | None = None
-        self._abandoned: set[Path] = set()
+        self._abandoned: tuple[Path, ...] = ()
         self._stage: StageIdentity | None = None
         self._failed = 0
-        self._model: StageModel | None = None
-        self._identified: DiagnosisRequest | None = None
+        self._model = StageModel({})  # the last one that was published
         self._doubtful: tuple[FitRequest, str] | None = None
         self._error = ""
-        # A simulated clock may stop.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._poll = self.create_timer(POLL_PERIOD, self._poll_job, clock=steady, autostart=False)
-        self.create_timer(self._parameter_set.settings.diagnostic_period, self._report, clock=steady)
-        self._watching = self.create_timer(WATCH_PERIOD, self._poll_bags, clock=steady)
+        steady_timer(self, POLL_PERIOD, self._poll_jobs)
+        steady_timer(self, WATCH_PERIOD, self._poll_bags)
+        steady_timer(self, self._settings.diagnostic_period, self._report)
         self.create_service(Trigger, "~/identify", self._on_trigger)
-        self._diagnosis = DiagnosisService(
-            self, lambda: self._identified, lambda: self._parameter_set.settings.diagnosis_directory, self._report
-        )
-        self._settings = self._parameter_set.settings
-        self._parameter_set.follow(self._on_change)
-        self._begin(self._settings)
+        parameters.follow(self._on_change)
+        self._begin()
 
     def destroy_node(self) -> None:
         """Stop running jobs, then destroy the node."""
@@ -302,37 +296,26 @@ class Identify(Node):
         self._diagnosis.end()
         super().destroy_node()
 
-    def _on_model(self, message: String) -> None:
-        """Take note of a model that somebody else has published."""
-        document = str(message.data)
-        if document in self._echoes:
-            while self._echoes.popleft() != document:
-                pass
-        elif len(document) <= TOPIC_MODEL_CHARACTERS:
-            self._in_use = document
-
     def _on_change(self, settings: IdentifySettings) -> None:
         """Repeat the identification, unless only the diagnosis folder has changed."""
         before, self._settings = self._settings, settings
         if settings.watch_directory != before.watch_directory:
             # Another folder may hold bags of another stage.
             self._stage = None
-        moved = settings.diagnosis_directory != before.diagnosis_directory
-        if not moved or replace(settings, diagnosis_directory=before.diagnosis_directory) != before:
-            self._begin(settings)
+        if settings == before or replace(settings, diagnosis_directory=before.diagnosis_directory) != before:
+            self._begin()
 
-    def _begin(self, settings: IdentifySettings) -> None:
+    def _begin(self) -> None:
         """Stop the running identification and start the one that the settings request."""
         self._end_job()
-        self._error = ""
-        self._doubtful = None
+        self._error, self._doubtful = "", None
         self._waiting.clear()
-        self._asked = settings.request if settings.request.bags else None
-        self._watch = BagWatch(settings.watch_directory) if settings.watch_directory else None
+        request, folder = self._settings.request, self._settings.watch_directory
+        self._asked = request if request.bags else None
+        self._watch = BagWatch(folder) if folder else None
         if not self._asked and not self._watch:
             self.get_logger().info(NOTHING_TO_DO)
         self._poll_bags()
-        self._start_next()
         self._report()
 
     def _poll_bags(self) -> None:
@@ -344,22 +327,22 @@ class Identify(Node):
                 continue
             self.get_logger().info(shown(f"{bag} is complete"))
             self._waiting.append(bag)
-        abandoned = set(self._watch.abandoned) if self._watch else set()
-        for bag in sorted(abandoned - self._abandoned):
-            self.get_logger().warning(shown(abandonment([bag])))
-        self._abandoned = abandoned
+        before, self._abandoned = self._abandoned, self._watch.abandoned if self._watch else ()
+        for bag in self._abandoned:
+            if bag not in before:
+                self.get_logger().warning(shown(abandonment([bag])))
         self._start_next()
 
     def _on_trigger(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
         """Publish a withheld model, if any; else identify again from the given bags or from the newest watched bag."""
         if self._doubtful:
-            (asked, document), self._doubtful = self._doubtful, None
+            asked, document = self._doubtful
             self._take(asked, FitOutcome(document))
             response.success = not self._error
             response.message = self._error or shown(f"published the model of {asked.source}")
             return response
         try:
-            self._begin(self._parameter_set.settings)
+            self._begin()
         except SlpiError as error:
             response.success, response.message = False, str(error)
             return response
@@ -372,46 +355,32 @@ class Identify(Node):
         request = None if self._job else self._next_request()
         if request:
             self._job = WorkerProcess(fit, request, FitOutcome, f"{request.source}: the identification")
-            self._job_start = time.monotonic()
-            self._poll.reset()
 
     def _next_request(self) -> FitRequest | None:
         """Return the request of the settings first, then one for each queued bag of the watched folder, then None."""
         request, self._asked = self._asked, None
         if not request and self._waiting:
             bag = str(self._waiting.popleft())
-            request = replace(self._parameter_set.settings.request, bags=(bag,), stage=self._stage)
-        return replace(request, in_use=self._in_use) if request else None
+            request = replace(self._settings.request, bags=(bag,), stage=self._stage)
+        return replace(request, in_use=self._in_use.document) if request else None
 
     def _end_job(self) -> None:
-        self._poll.cancel()
         if self._job:
             self._job.end()
             self._job = None
 
-    def _poll_job(self) -> None:
-        waited = time.monotonic() - self._begun
-        others = not self._in_use and self.count_publishers("stage_model") > 1
-        if waited < (LATCHED_WITHIN if others else DISCOVERY):
-            return
-        outcome = self._job.outcome() if self._job else None
-        if self._job and outcome:
-            request, self._job = self._job.request, None
-            self._poll.cancel()
-            if request.in_use == self._in_use or request.unconditional or outcome.error:
-                self._take(request, outcome)
+    def _poll_jobs(self) -> None:
+        self._diagnosis.poll()
+        job = self._job if self._in_use.known else None
+        outcome = job.outcome() if job else None
+        if job and outcome:
+            self._job = None
+            if job.request.in_use == self._in_use.document or job.request.unconditional or outcome.error:
+                self._take(job.request, outcome)
             else:
                 # Another model has come into use meanwhile: compare with that one.
-                self._asked = request
+                self._asked = job.request
             self._start_next()
-
-    def _write(self, model: StageModel, output: str) -> None:
-        try:
-            if output:
-                allow_document(output, "model")
-                save_model(model, output)
-        except SlpiError as error:
-            self._fail(error)
 
     def _take(self, request: FitRequest, outcome: FitOutcome) -> None:
         if outcome.doubt:
@@ -421,24 +390,27 @@ class Identify(Node):
                 "record more"
             )
             self.get_logger().warning(self._error)
-            self._report()
-            return
-        self._doubtful, self._error = None, ""
-        if outcome.document:
-            self._model = parse_model(outcome.document, "identify")
-            self._stage = StageIdentity.of(self._model, request.stage)
-            self._identified = DiagnosisRequest(
-                request.bags, request.topic, outcome.document, surroundings=request.surroundings
-            )
-            self._diagnosis.forget()
-            self._write(self._model, request.output)
-            self._in_use = outcome.document
-            self._echoes.append(outcome.document)
-            self._publisher.publish(String(data=outcome.document))
-            self.get_logger().info(shown(described(self._model)))
-        if outcome.error:
+        elif outcome.error:
+            self._doubtful = None
             self._fail(outcome.error)
+        else:
+            self._doubtful, self._error = None, ""
+            self._publish(request, outcome.document)
         self._report()
+
+    def _publish(self, request: FitRequest, document: str) -> None:
+        """Publish a model, write it to the file `output`, if any, and have it diagnosed from now on."""
+        self._model = parse_model(document, "identify")
+        self._stage = StageIdentity.of(self._model, request.stage)
+        self._diagnosis.use(DiagnosisRequest(request.bags, request.topic, document, surroundings=request.surroundings))
+        try:
+            if request.output:
+                allow_document(request.output, "model")
+                save_model(self._model, request.output)
+        except SlpiError as error:
+            self._fail(error)
+        self._in_use.publish(document)
+        self.get_logger().info(shown(described(self._model)))
 
     def _fail(self, error: SlpiError | str) -> None:
         """Count and log the reason why a bag gave no model, or why the model was not written."""
@@ -450,15 +422,15 @@ class Identify(Node):
         model = self._model
         values: dict[str, object] = {
             "state": "identifying" if self._job else "waiting",
-            "model.created": model.created if model else "",
-            "model.hardware_id": model.hardware_id if model else "",
+            "model.created": model.created,
+            "model.hardware_id": model.hardware_id,
             "waiting_bags": len(self._waiting),
             "abandoned_bags": len(self._abandoned),
             "failed": self._failed,
             "last_error": self._error,
             **self._diagnosis.values,
         }
-        for name, axis in model.axes.items() if model else ():
+        for name, axis in model.axes.items():
             quality = axis.quality
             values |= {
                 f"{name}.kind": axis.kind,
@@ -470,20 +442,20 @@ class Identify(Node):
                 f"{name}.covered": f"{quality.covered:.3f}",
                 f"{name}.source": quality.source,
             }
-        problems = ((WARN if self._doubtful else ERROR, self._error),) if self._error else ()
-        if not problems and not model and not self._job and not self._watch:
-            problems = ((WARN, NOTHING_TO_DO),)
-        if self._abandoned:
-            problems = (*problems, (WARN, abandonment(sorted(self._abandoned))))
-        if self._diagnosis.error:
-            problems = (*problems, (WARN, self._diagnosis.error))
-        hardware_id = model.hardware_id if model else ""
-        self._diagnostics.report(Health(problems, self._activity(), values, hardware_id))
+        idle = not model.axes and not self._job and not self._watch
+        problems = (
+            (WARN if self._doubtful else ERROR, self._error),
+            (WARN, NOTHING_TO_DO if idle and not self._error else ""),
+            (WARN, abandonment(self._abandoned) if self._abandoned else ""),
+            (WARN, self._diagnosis.error),
+        )
+        found = tuple((level, text) for level, text in problems if text)
+        self._diagnostics.report(Health(found, self._activity(), values, model.hardware_id))
 
     def _activity(self) -> str:
         if self._job:
-            return f"identifying {self._job.request.source} for {time.monotonic() - self._job_start:.0f} s"
-        return self._diagnosis.activity or (described(self._model) if self._model else "")
+            return f"identifying {self._job.request.source} for {self._job.seconds:.0f} s"
+        return self._diagnosis.activity or (described(self._model) if self._model.axes else "")
 
 
 def _is_utf8(path: Path) -> bool:

@@ -5,6 +5,7 @@ import multiprocessing
 import os
 import signal
 import threading
+import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
@@ -33,7 +34,7 @@ class WorkerProcess(Generic[Request, Outcome]):
     def __init__(
         self, work: Callable[[Request], Outcome], request: Request, outcome: Callable[..., Outcome], what: str
     ) -> None:
-        self.request = request
+        self.request, self._begun = request, time.monotonic()
         self._make, self._what = outcome, what
         # Not fork: the middleware threads do not survive a fork.
         context = multiprocessing.get_context("spawn")
@@ -46,6 +47,11 @@ class WorkerProcess(Generic[Request, Outcome]):
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
         sender.close()
+
+    @property
+    def seconds(self) -> float:
+        """Time since the start of the process (s)."""
+        return time.monotonic() - self._begun
 
     def outcome(self) -> Outcome | None:
         """Return the outcome, or None while the process is running; does not block."""
@@ -89,7 +95,7 @@ class StageIdentity:
     axes: tuple[str, ...]
 
     @classmethod
-    def of(cls, model: StageModel, before: "StageIdentity | None") -> "StageIdentity":
+    def of(cls, model: StageModel, before: "StageIdentity | None" = None) -> "StageIdentity":
         """Return the identity of a model's stage; a missing hardware id is taken from `before`."""
         return cls(model.hardware_id or (before.hardware_id if before else ""), tuple(model.axes))
 
@@ -109,11 +115,22 @@ class StageIdentity:
 
 
 @dataclass(frozen=True)
-class FitRequest:
-    """Request of an identification from all `bags` in one fit."""
+class BagsRequest:
+    """Request for which all `bags` are read together."""
 
     bags: tuple[str, ...]
     topic: str
+
+    @property
+    def source(self) -> str:
+        """Text that names the bags."""
+        return ", ".join(self.bags)
+
+
+@dataclass(frozen=True)
+class FitRequest(BagsRequest):
+    """Request of an identification in one fit."""
+
     kind: str
     start: float | None  # s, of the fitted part; None: first stamp
     stop: float | None  # s; None: last stamp
@@ -124,11 +141,6 @@ class FitRequest:
     sensor_delay: float = 0.0  # s, known
     sensor_lag: float = 0.0  # s, known
     surroundings: tuple[str, ...] = ()  # recorded quantities that the stage may follow
-
-    @property
-    def source(self) -> str:
-        """Text that names the bags."""
-        return ", ".join(self.bags)
 
 
 @dataclass(frozen=True)
@@ -177,26 +189,19 @@ def _in_use(request: FitRequest, records: Sequence[Record]) -> StageModel | None
         else:
             return None
         for record in records:
-            StageIdentity.of(model, None).require(record)
+            StageIdentity.of(model).require(record)
     except SlpiError:
         return None
     return model
 
 
 @dataclass(frozen=True)
-class DiagnosisRequest:
-    """Request of a diagnosis of the model `document` on all `bags` together; `folder`: "" if not chosen yet."""
+class DiagnosisRequest(BagsRequest):
+    """Request of a diagnosis of the model `document`; `folder`: "" if not chosen yet."""
 
-    bags: tuple[str, ...]
-    topic: str
     document: str
     folder: str = ""
     surroundings: tuple[str, ...] = ()  # recorded quantities that are looked at; empty: all
-
-    @property
-    def source(self) -> str:
-        """Text that names the bags."""
-        return ", ".join(self.bags)
 
 
 @dataclass(frozen=True)

@@ -1,8 +1,8 @@
-"""Node parameters, declared in one table and validated together."""
+"""Node parameters, declared in one table and validated together, and those that several nodes have."""
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from difflib import get_close_matches
 from typing import Any, Generic, TypeVar
 
@@ -11,9 +11,12 @@ from rclpy.node import Node
 from rclpy.parameter import Parameter
 
 from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.excitation.drives import slew_limits
+from slpi_ros.model.limits import Limits
 
 Settings = TypeVar("Settings")
 Values = Mapping[str, Any]
+Range = tuple[float, float]  # smallest and largest number
 # Parameters that rclpy declares, some of them later.
 KNOWN_TO_RCLPY = ("use_sim_time", "qos_overrides", "start_type_description_service")
 
@@ -26,21 +29,21 @@ class Declaration:
     default: Any
     description: str  # for ``ros2 param describe``
     read_only: bool = False  # can only be set at the start of the node
-    between: tuple[float, float] | None = None  # smallest and largest number; None: any
+    between: Range | None = None  # of a number; None: any
     number: bool = False  # a double, also given as an integer or as one value for each axis
     each_axis: bool = False  # each axis may have its own value
     choices: tuple[str, ...] = ()  # of a string; (): any
+    required: bool = False  # NaN is refused; else it stands for None, if it is the default
 
     def read(self, values: Values, axes: Sequence[str]) -> Any:
         """Return the validated value from `values`: a tuple with one value per axis if `each_axis`."""
-        # None stands for NaN, if that is the default: it depends on other parameters.
         given = values[self.name]
-        if self._is_nan(given) and self._is_nan(self.default):
+        if _is_nan(given) and _is_nan(self.default) and not self.required:
+            # It depends on other parameters.
             return None
-        if self.each_axis and self.between:
-            return tuple(numbers(values, self.name, axes, *self.between))
         if self.number and self.between:
-            return number(values, self.name, *self.between)
+            found = numbers(values, self.name, axes if self.each_axis else ("",), *self.between)
+            return tuple(found) if self.each_axis else found[0]
         if self.between:
             low, high = map(int, self.between)
             if isinstance(given, bool) or not isinstance(given, int) or not low <= given <= high:
@@ -56,10 +59,6 @@ class Declaration:
         """Whether it is on or off, which YAML takes for true and false."""
         return "on" in self.choices
 
-    @staticmethod
-    def _is_nan(value: Any) -> bool:
-        return isinstance(value, float) and math.isnan(value)
-
     def descriptor(self) -> ParameterDescriptor:
         """Return the ROS descriptor, with the range that rclpy checks unless the default, NaN, is outside of it."""
         described = ParameterDescriptor(
@@ -67,13 +66,87 @@ class Declaration:
             read_only=self.read_only,
             dynamic_typing=self.number or self._is_switch,
         )
-        if self.between and not self._is_nan(self.default):
+        if self.between and not _is_nan(self.default):
             low, high = self.between
             if self.number:
                 described.floating_point_range = [FloatingPointRange(from_value=low, to_value=high)]
             else:
                 described.integer_range = [IntegerRange(from_value=int(low), to_value=int(high))]
         return described
+
+
+def _is_nan(value: Any) -> bool:
+    return isinstance(value, float) and math.isnan(value)
+
+
+def scalar(name: str, default: float, description: str, between: Range, *, read_only: bool = False) -> Declaration:
+    """Declare a numeric parameter with a single value."""
+    return Declaration(name, default, description, read_only, between, number=True)
+
+
+def each_axis(name: str, default: float, description: str, between: Range, *, required: bool = False) -> Declaration:
+    """Declare a numeric parameter that may have one value for each axis."""
+    description += " One value, or one for each axis."
+    return Declaration(name, default, description, between=between, number=True, each_axis=True, required=required)
+
+
+def text(name: str, default: str, description: str, *choices: str, read_only: bool = False) -> Declaration:
+    """Declare a string parameter, limited to `choices` if any are given."""
+    return Declaration(name, default, description, read_only, choices=choices)
+
+
+def read_only(*declarations: Declaration) -> tuple[Declaration, ...]:
+    """Return declarations of parameters that can only be set at the start of the node."""
+    return tuple(replace(each, read_only=True) for each in declarations)
+
+
+# Parameters of several nodes
+
+VOLTAGE = (-10_000.0, 10_000.0)
+AXES = Declaration("axes", ["x"], "Names of the axes, in the order of voltage_command.", read_only=True)
+ACCELERATION_LIMIT = each_axis(
+    "acceleration_limit", 0.0, "Maximum change of the rate of a voltage, V/s^2; 0: no limit.", (0.0, 1e12)
+)
+STATE_TIMEOUT = scalar(
+    "state_timeout", 0.5,
+    "Seconds without a valid stage_state after which a drive is given up; reports of the voltage may be as late.",
+    (1e-3, 60.0), read_only=True,
+)  # fmt: skip
+DIAGNOSTIC_PERIOD = scalar("diagnostic_period", 1.0, "Period of /diagnostics, seconds.", (0.05, 3600.0), read_only=True)
+REALTIME_PRIORITY = Declaration(
+    "realtime_priority", 0, "SCHED_FIFO priority, 1 to 99, if the system permits; 0: normal scheduling.",
+    read_only=True, between=(0, 99),
+)  # fmt: skip
+# Of simulators.
+SEED = Declaration("seed", 0, "Seed of the random stage and of the noise.", between=(0, 2**53))
+
+
+def voltage_limits(used: str = "", low: float = math.nan, high: float = math.nan) -> tuple[Declaration, ...]:
+    """Declare voltage_min and voltage_max with defaults (V; NaN: required), and slew_limit; `used`: how much of it."""
+    required = "; required" if math.isnan(low) else ""
+    slew = f"Maximum rate of a voltage, V/s{used}; NaN: the voltage range in 0.1 s. 0: no limit."
+    return (
+        each_axis("voltage_min", low, f"Lower voltage limit, volts{required}.", VOLTAGE, required=True),
+        each_axis("voltage_max", high, f"Upper voltage limit, volts{required}.", VOLTAGE, required=True),
+        each_axis("slew_limit", math.nan, slew, (0.0, 1e9)),
+    )
+
+
+def limits_of(values: Values) -> tuple[Limits, ...]:
+    """Return the limits of each axis from validated parameters; UsageError if voltage_min is not below voltage_max."""
+    lows, highs = values["voltage_min"], values["voltage_max"]
+    for name, low, high in zip(values["axes"], lows, highs, strict=True):
+        if not low < high:
+            raise UsageError(
+                f"axis '{name}': voltage_min {low:g} and voltage_max {high:g} V: the first is not below the second; "
+                "correct one of the two"
+            )
+    slews = slew_limits(values["slew_limit"], lows, highs)
+    accelerations = values.get("acceleration_limit", [0.0] * len(lows))
+    return tuple(
+        Limits(low, high, slew or math.inf, acceleration or math.inf)
+        for low, high, slew, acceleration in zip(lows, highs, slews, accelerations, strict=True)
+    )
 
 
 def validated(declarations: Sequence[Declaration], values: Values) -> dict[str, Any]:
@@ -131,11 +204,6 @@ class Parameters(Generic[Settings]):
     def _ours(self, changes: Sequence[Parameter]) -> dict[str, Any]:
         """Return the changes of declared parameters, without those of rclpy such as use_sim_time."""
         return {change.name: change.value for change in changes if change.name in self._values}
-
-
-def number(values: Values, name: str, low: float, high: float) -> float:
-    """Return the parameter `name` as a float; UsageError if it is not one finite number from `low` to `high`."""
-    return numbers(values, name, ("",), low, high)[0]
 
 
 def numbers(values: Values, name: str, axes: Sequence[str], low: float, high: float) -> list[float]:

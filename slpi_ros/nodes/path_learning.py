@@ -134,8 +134,8 @@ class PathLearning:
         if self._model is None:
             return
         self._era, self._opened = self._era + 1, True
-        model, prefix, limit = self._model, self._prefix, self.limit
-        self._ask(lambda: Opening(format_model(model), prefix, limit))
+        model, limit = self._model, self.limit
+        self._ask(lambda: Opening(format_model(model), self._prefix, limit))
 
     def corrected(
         self, names: Sequence[str], times: ArrayLike, positions: ArrayLike, *, as_block: bool = False
@@ -163,8 +163,8 @@ class PathLearning:
         """Take notice of a trajectory that was accepted; None: it is not learned."""
         if path is None:
             self.passes.end(start_ns or clock_ns)
-            return
-        self.passes.begin(path, start_ns, clock_ns, self._controller.trajectory.period, self.mode == ON)
+        else:
+            self.passes.begin(path, start_ns, clock_ns, self._controller.trajectory.period, self.mode == ON)
 
     def begin_block(self, path: SampledPath | None, block: Block) -> None:
         """Take notice of a block that a device will play and record; no path: it is not learned."""
@@ -202,8 +202,7 @@ class PathLearning:
         self.passes.forget()
         self.progress = {}
         self._era += 1
-        prefix = self._prefix
-        self._ask(lambda: Forgetting(prefix))
+        self._ask(lambda: Forgetting(self._prefix))
 
     def close(self) -> None:
         """End the process."""

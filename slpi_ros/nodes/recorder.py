@@ -4,14 +4,14 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.qos import DurabilityPolicy, QoSProfile, ReliabilityPolicy
+from rclpy.qos import DurabilityPolicy, QoSProfile
 
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.bag_writer import STORAGES, BagWriter
 from slpi_ros.io.messages import JOINT_STATE
-from slpi_ros.nodes.common import message_class, request_stop
+from slpi_ros.nodes import parameters as declare
+from slpi_ros.nodes.common import message_class, reliability_of, request_stop, steady_timer
 from slpi_ros.nodes.parameters import Declaration, Parameters, validated
 
 # Queue length for bursts during slow disk writes.
@@ -20,14 +20,14 @@ DISCOVERY_PERIOD = 0.1
 # Discovery of publishers may take several seconds.
 PATIENCE = 5.0
 STAGE_STATE = "stage_state"
-DECLARATIONS = (
-    Declaration("output", "", "rosbag2 folder to create; required.", read_only=True),
-    Declaration("topics", [STAGE_STATE], "Topics to record.", read_only=True),
-    Declaration("storage", "mcap", "File format: mcap or sqlite3.", read_only=True, choices=tuple(STORAGES)),
-    Declaration(
+DECLARATIONS = declare.read_only(
+    declare.text("output", "", "rosbag2 folder to create; required."),
+    Declaration("topics", [STAGE_STATE], "Topics to record."),
+    declare.text("storage", "mcap", "File format: mcap or sqlite3.", *STORAGES),
+    declare.scalar(
         "duration", 0.0,
         "Seconds from the first message; without any message the node stops 5 s after this time. 0: until a signal.",
-        read_only=True, between=(0.0, 1e9), number=True,
+        (0.0, 1e9),
     ),
 )  # fmt: skip
 
@@ -57,17 +57,18 @@ class Recorder(Node):
             # Subscribed before discovery, as the type is known, so that no message is lost.
             if topic.rpartition("/")[2] == STAGE_STATE:
                 self._subscribe(name, JOINT_STATE, ())
-        # A simulated clock may stop.
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._discovery = self.create_timer(DISCOVERY_PERIOD, self._discover, clock=self._steady)
+        self._discovery = steady_timer(self, DISCOVERY_PERIOD, self._discover)
         if self._duration:
-            self._end = self._stop_in(self._duration + PATIENCE)
+            self._end = steady_timer(self, self._duration + PATIENCE, request_stop)
         self.get_logger().info(f"recording {', '.join(self._awaited)} into {output}")
 
     def destroy_node(self) -> None:
         """Complete the bag, then destroy the node; RecordError if it is empty or cannot be completed."""
         try:
-            self._finish()
+            if self.context.ok():
+                self._drain()
+            if self._bag is not None:
+                self._finish(self._bag)
         finally:
             super().destroy_node()
 
@@ -92,13 +93,11 @@ class Recorder(Node):
 
     def _subscribe(self, name: str, msgtype: str, publishers: Sequence[Any]) -> None:
         """Subscribe to a topic with a QoS that all its publishers offer; resubscribe if that QoS has changed."""
-        offers = [publisher.qos_profile for publisher in publishers]
-        reliable = all(offer.reliability == ReliabilityPolicy.RELIABLE for offer in offers)
-        latched = all(offer.durability == DurabilityPolicy.TRANSIENT_LOCAL for offer in offers) and offers
+        latched = all(each.qos_profile.durability == DurabilityPolicy.TRANSIENT_LOCAL for each in publishers)
         qos = QoSProfile(
             depth=DEPTH,
-            reliability=ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT,
-            durability=DurabilityPolicy.TRANSIENT_LOCAL if latched else DurabilityPolicy.VOLATILE,
+            reliability=reliability_of(publishers),
+            durability=DurabilityPolicy.TRANSIENT_LOCAL if publishers and latched else DurabilityPolicy.VOLATILE,
         )
         former = self._listening.get(name)
         if former is not None and former.qos_profile == qos:
@@ -111,15 +110,12 @@ class Recorder(Node):
             message_class(name, msgtype), name, partial(self._record, name), qos, raw=True
         )
 
-    def _stop_in(self, seconds: float) -> Any:
-        return self.create_timer(seconds, lambda: request_stop(), clock=self._steady)
-
     def _record(self, name: str, message: bytes) -> None:
         if self._bag is None:
             return
         if self._duration and not self._bag.message_count:
             self.destroy_timer(self._end)
-            self._end = self._stop_in(self._duration)
+            self._end = steady_timer(self, self._duration, request_stop)
         try:
             self._bag.write(self.get_clock().now().nanoseconds, message, name)
         except RecordError as error:
@@ -137,13 +133,8 @@ class Recorder(Node):
                         break
                     self._record(name, taken[0])
 
-    def _finish(self) -> None:
+    def _finish(self, bag: BagWriter) -> None:
         """Close the bag and move it to its final path; RecordError if it is empty."""
-        if self.context.ok():
-            self._drain()
-        bag, self._bag = self._bag, None
-        if bag is None:
-            return
         if not bag.message_count:
             bag.discard()
             raise RecordError(f"{bag.path}: not written, as no message came; check the parameter topics")

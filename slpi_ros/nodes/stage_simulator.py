@@ -4,21 +4,23 @@ import hashlib
 import math
 import time
 from array import array
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import fields
 from functools import partial
 
 import numpy as np
-from builtin_interfaces.msg import Time
-from rclpy.clock import Clock, ClockType
+from builtin_interfaces.msg import Time as Stamp
 from rclpy.node import Node
+from rclpy.time import Time
 from rosgraph_msgs.msg import Clock as ClockMsg
 from sensor_msgs.msg import JointState, Temperature
 from std_msgs.msg import Float64, Float64MultiArray
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import UsageError
-from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.nodes.common import COMMANDS
+from slpi_ros.model.limits import Limits
+from slpi_ros.nodes import parameters as declare
+from slpi_ros.nodes.common import COMMANDS, steady_timer
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, validated
 from slpi_ros.simulation.character import Character
 from slpi_ros.simulation.room import Room
@@ -29,70 +31,55 @@ LOG_PERIOD = 5.0
 QUIET = 0.3
 # Seconds; creep has decayed after this time.
 DAY = 86_400.0
-VOLTAGE = (-10_000.0, 10_000.0)
 # Noise of the sensors in the room, kelvin and newton; readings of the load for each of the temperature.
 NOISE_OF_TEMPERATURE, NOISE_OF_LOAD, LOADS = 0.01, 0.01, 10
 GIVEN, DRAWN, HIDDEN = "given", "drawn", "hidden"
-DECLARATIONS = (
-    Declaration("axes", ["x"], "Names of the axes, in the order of voltage_command.", read_only=True),
-    Declaration(
+DECLARATIONS = declare.read_only(
+    declare.AXES,
+    declare.text(
         "hardware_id", "",
         "Identifier of the stage in stage_state; empty: simulated-PRESET, or simulated-SEED without a preset, and what "
         "identifies the character, if any.",
-        read_only=True,
     ),
-    Declaration("preset", "", "p11: the stage of the MPI paper; empty: a random one.", read_only=True),
-    Declaration("seed", 0, "Seed of the random stage and of the noise.", read_only=True, between=(0, 2**53)),
-    Declaration(
-        "noise_rms", 8e-9, "Sensor noise without a preset, metres rms.", read_only=True, between=(0.0, 1.0), number=True
-    ),
-    Declaration(
-        "voltage_min", 0.0, "Lower limit of the amplifier, volts.", read_only=True, between=VOLTAGE, number=True
-    ),
-    Declaration(
-        "voltage_max", 100.0, "Upper limit of the amplifier, volts.", read_only=True, between=VOLTAGE, number=True
-    ),
+    declare.text("preset", "", "p11: the stage of the MPI paper; empty: a random one."),
+    declare.SEED,
+    declare.scalar("noise_rms", 8e-9, "Sensor noise without a preset, metres rms.", (0.0, 1.0)),
+    declare.scalar("voltage_min", 0.0, "Lower limit of the amplifier, volts.", declare.VOLTAGE),
+    declare.scalar("voltage_max", 100.0, "Upper limit of the amplifier, volts.", declare.VOLTAGE),
     Declaration(
         "initial_state", [0.0],
         "Voltages applied to all axes one day before the start, followed by 0 V, to reproduce an earlier state.",
-        read_only=True, number=True,
+        number=True,
     ),
     Declaration(
-        "answer_commands", True, "Whether to publish one state for each command; else `rate` states per second.",
-        read_only=True,
+        "answer_commands", True, "Whether to publish one state for each command; else `rate` states per second."
     ),
-    Declaration(
-        "rate", 200.0, "States per second without answer_commands, and while no commands come, hertz.",
-        read_only=True, between=(1e-3, 1e4), number=True,
+    declare.scalar(
+        "rate", 200.0, "States per second without answer_commands, and while no commands come, hertz.", (1e-3, 1e4)
     ),
-    Declaration(
+    declare.scalar(
         "speed", 1.0,
         "Stage seconds per second. Other than 1: the node publishes /clock at `rate`, for nodes with use_sim_time.",
-        read_only=True, between=(0.01, 1000.0), number=True,
+        (0.01, 1000.0),
     ),
-    Declaration(
+    declare.text(
         "character", GIVEN,
         "given: the effects named below. drawn: one or two effects per axis, drawn from the seed and logged. hidden: "
         "the same, but not told.",
-        read_only=True, choices=(GIVEN, DRAWN, HIDDEN),
+        GIVEN, DRAWN, HIDDEN,
     ),
-    Declaration(
+    declare.scalar(
         "room_swing", 0.0,
         "Rms of the temperature of the room about 21 °C, kelvin; more than 0: it is published, as is the load.",
-        read_only=True, between=(0.0, 50.0), number=True,
+        (0.0, 50.0),
     ),
-    Declaration(
-        "room_load", 2.0, "Largest load of the stage, newton; it comes and goes.",
-        read_only=True, between=(0.0, 1e4), number=True,
-    ),
-    Declaration(
-        "room_rate", 2.0, "Readings of the temperature per second, hertz; of the load ten times as many.",
-        read_only=True, between=(1e-3, 100.0), number=True,
+    declare.scalar("room_load", 2.0, "Largest load of the stage, newton; it comes and goes.", (0.0, 1e4)),
+    declare.scalar(
+        "room_rate", 2.0, "Readings of the temperature per second, hertz; of the load ten times as many.", (1e-3, 100.0)
     ),
     *(
-        Declaration(
-            figure.name, figure.default, figure.metadata["meaning"] + " One value, or one for each axis.",
-            read_only=True, between=figure.metadata["between"], number=True, each_axis=True,
+        declare.each_axis(
+            figure.name, getattr(Character(), figure.name), figure.metadata["meaning"], figure.metadata["between"]
         )
         for figure in fields(Character)
     ),
@@ -119,8 +106,8 @@ class StageSimulator(Node):
         values = Parameters(self, DECLARATIONS, partial(validated, DECLARATIONS)).settings
         axes, preset, seed = list(values["axes"]), values["preset"], values["seed"]
         self._stage, identity = _make_stage(values)
-        self._low, self._high = _limits(self._stage, values["voltage_min"], values["voltage_max"])
-        history = self._initial_history(values["initial_state"])
+        self._limits = _limits(self._stage, values["voltage_min"], values["voltage_max"])
+        history, rest = _history(values["initial_state"], self._limits), self._limits.clip(0.0)
         self._state = JointState(name=axes)
         self._state.header.frame_id = values["hardware_id"] or f"simulated-{preset or seed}{identity}"
         for axis, one in self._stage.axes.items():
@@ -129,51 +116,23 @@ class StageSimulator(Node):
         self._speed, self._begun_ns = values["speed"], time.monotonic_ns()
         self._origin_ns, self._latest_ns = self.get_clock().now().nanoseconds, 0
         begun = self._now_ns() * 1e-9
-        for v in (*history, self._clip(0.0)):
+        for v in (*history, rest):
             self._stage.step(begun - DAY, [v] * len(axes))
         self._stage.begin_drift(begun)
-        self._apply([self._clip(0.0)] * len(axes))
+        self._apply([rest] * len(axes))
         self._publisher = self.create_publisher(JointState, "stage_state", COMMANDS)
         self._answers, self._commanded_at = values["answer_commands"], -math.inf
-        period = 1.0 / values["rate"]
-        # The system clock may be set back.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        if self._speed == 1.0:
-            self.create_timer(period, self._on_timer, clock=steady)
-        else:
+        if self._speed != 1.0:
             self._clock_publisher = self.create_publisher(ClockMsg, "/clock", COMMANDS)
-            self.create_timer(period / self._speed, self._on_tick, clock=steady)
+        steady_timer(self, 1.0 / (values["rate"] * self._speed), self._on_timer)
         self._commands = self.create_subscription(Float64MultiArray, "voltage_command", self._on_command, COMMANDS)
         self.get_logger().info(
-            f"stage '{self._state.header.frame_id}', axes {', '.join(axes)}, {self._low:g} to {self._high:g} V: takes "
-            f"{self._commands.topic_name}, publishes {self._publisher.topic_name}"
+            f"stage '{self._state.header.frame_id}', axes {', '.join(axes)}, {self._limits.lower:g} to "
+            f"{self._limits.upper:g} V: takes {self._commands.topic_name}, publishes {self._publisher.topic_name}"
         )
         self._publish()
         if values["room_swing"]:
-            self._open_room(values, steady)
-
-    def _open_room(self, values: Values, steady: Clock) -> None:
-        """Publish what sensors in the room of the stage read."""
-        self._room, self._readings = _room(values), np.random.default_rng([values["seed"], 3])
-        self._temperature = self.create_publisher(Temperature, "room/temperature", COMMANDS)
-        self._load = self.create_publisher(Float64, "load", COMMANDS)
-        period = 1.0 / (values["room_rate"] * self._speed)
-        self.create_timer(period, self._on_temperature, clock=steady)
-        self.create_timer(period / LOADS, self._on_load, clock=steady)
-
-    def _on_temperature(self) -> None:
-        now_ns = self._now_ns()
-        value = float(self._room.temperature(np.array([now_ns * 1e-9]))[0]) + self._noise(NOISE_OF_TEMPERATURE)
-        message = Temperature(temperature=value, variance=NOISE_OF_TEMPERATURE**2)
-        message.header.stamp = _time(now_ns)
-        self._temperature.publish(message)
-
-    def _on_load(self) -> None:
-        value = float(self._room.load(np.array([self._now_ns() * 1e-9]))[0])
-        self._load.publish(Float64(data=value + self._noise(NOISE_OF_LOAD)))
-
-    def _noise(self, rms: float) -> float:
-        return rms * float(self._readings.standard_normal())
+            RoomSensors(self, values, self._now_ns)
 
     def _now_ns(self) -> int:
         """Return the time of the stage (ns), which never decreases, even if the clock of the node is set back."""
@@ -184,11 +143,9 @@ class StageSimulator(Node):
         self._latest_ns = max(self._latest_ns, now)
         return self._latest_ns
 
-    def _on_tick(self) -> None:
-        self._clock_publisher.publish(ClockMsg(clock=_time(self._now_ns())))
-        self._on_timer()
-
     def _on_timer(self) -> None:
+        if self._speed != 1.0:
+            self._clock_publisher.publish(ClockMsg(clock=_stamp(self._now_ns())))
         quiet = time.monotonic() > self._commanded_at + QUIET or not self.count_publishers(self._commands.topic_name)
         if quiet or not self._answers:
             self._apply(self._state.effort)
@@ -205,7 +162,7 @@ class StageSimulator(Node):
             )
             return
         self._commanded_at = time.monotonic()
-        self._apply([self._clip(v) for v in voltages])
+        self._apply([self._limits.clip(v) for v in voltages])
         if self._answers:
             self._publish()
 
@@ -214,25 +171,48 @@ class StageSimulator(Node):
         self._state.effort = array("d", voltages)
 
     def _publish(self) -> None:
-        self._state.header.stamp = _time(self._latest_ns)
+        self._state.header.stamp = _stamp(self._latest_ns)
         self._state.position = array("d", self._stage.measure(self._displacement))
         self._publisher.publish(self._state)
 
-    def _clip(self, voltage: float) -> float:
-        return min(max(voltage, self._low), self._high)
 
-    def _initial_history(self, given: object) -> list[float]:
-        history = list(given) if isinstance(given, Sequence | array) and not isinstance(given, str) else [math.nan]
-        if not all(self._low <= v <= self._high for v in history):
-            raise UsageError(
-                f"stage_simulator: initial_state is {given!r}; give voltages within {self._low} to {self._high} V"
-            )
-        return history
+class RoomSensors:
+    """Publish what sensors in the room of the stage read: its temperature, and the load."""
+
+    def __init__(self, node: Node, values: Values, now_ns: Callable[[], int]) -> None:
+        self._room, self._now_ns = _room(values), now_ns
+        self._random = np.random.default_rng([values["seed"], 3])
+        self._temperature = node.create_publisher(Temperature, "room/temperature", COMMANDS)
+        self._load = node.create_publisher(Float64, "load", COMMANDS)
+        period = 1.0 / (values["room_rate"] * values["speed"])
+        steady_timer(node, period, self._on_temperature)
+        steady_timer(node, period / LOADS, self._on_load)
+
+    def _on_temperature(self) -> None:
+        now_ns = self._now_ns()
+        value = self._read(self._room.temperature, now_ns, NOISE_OF_TEMPERATURE)
+        message = Temperature(temperature=value, variance=NOISE_OF_TEMPERATURE**2)
+        message.header.stamp = _stamp(now_ns)
+        self._temperature.publish(message)
+
+    def _on_load(self) -> None:
+        self._load.publish(Float64(data=self._read(self._room.load, self._now_ns(), NOISE_OF_LOAD)))
+
+    def _read(self, quantity: Callable[[FloatArray], FloatArray], now_ns: int, noise_rms: float) -> float:
+        return float(quantity(np.array([now_ns * 1e-9]))[0]) + noise_rms * float(self._random.standard_normal())
 
 
-def _time(nanoseconds: int) -> Time:
-    seconds, rest = divmod(nanoseconds, SECOND_NS)
-    return Time(sec=seconds, nanosec=rest)
+def _stamp(nanoseconds: int) -> Stamp:
+    return Time(nanoseconds=nanoseconds).to_msg()
+
+
+def _history(given: object, limits: Limits) -> list[float]:
+    history = list(given) if isinstance(given, Sequence | array) and not isinstance(given, str) else [math.nan]
+    if not all(limits.lower <= v <= limits.upper for v in history):
+        raise UsageError(
+            f"stage_simulator: initial_state is {given!r}; give voltages within {limits.lower} to {limits.upper} V"
+        )
+    return history
 
 
 def _make_stage(values: Values) -> tuple[Stage, str]:
@@ -265,11 +245,11 @@ def _room(values: Values) -> Room:
     return Room(values["seed"], values["room_swing"], values["room_load"])
 
 
-def _limits(stage: Stage, low: float, high: float) -> tuple[float, float]:
+def _limits(stage: Stage, low: float, high: float) -> Limits:
     lowest, highest = stage.voltage_range
     if not lowest <= low < high <= highest:
         raise UsageError(
             f"stage_simulator: voltage_min is {low} V and voltage_max {high} V; "
             f"give the lower one first, both within {lowest} to {highest} V"
         )
-    return low, high
+    return Limits(low, high)

@@ -1,9 +1,7 @@
 """Executables of the nodes: signals are handled before ROS is imported, which takes most of the time of a start."""
 
 # Few imports: until the handlers are set, SIGINT ends the process with a traceback.
-import signal
 import sys
-import threading
 import warnings
 from importlib import import_module
 
@@ -16,11 +14,7 @@ if TYPE_CHECKING:
 
 def _executable(name: str, node: str) -> "Callable[[], int]":
     def main() -> int:
-        stop.of_process = stop.Stop()
-        # Python allows signal handlers in the main thread only. They stay until the process has ended.
-        if threading.current_thread() is threading.main_thread():
-            for number in stop.SIGNALS:
-                signal.signal(number, stop.of_process.on_signal)
+        stop.of_process = stop.listening()
         from slpi_ros.errors import DependencyError, dependencies_needed, shown
 
         # Like a line of the node's log, without the line of code that warns.

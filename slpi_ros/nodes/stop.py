@@ -1,6 +1,7 @@
 """Request to stop the node of this process, by a signal or by an error."""
 
 import signal
+import threading
 
 TYPE_CHECKING = False
 if TYPE_CHECKING:
@@ -24,6 +25,16 @@ class Stop:
         self.signals += 1
         if self.signals > PATIENT_SIGNALS:
             raise KeyboardInterrupt
+
+
+def listening() -> Stop:
+    """Return a stop request of this process, which SIGINT and SIGTERM are from now on."""
+    stop = Stop()
+    # Python allows signal handlers in the main thread only. They stay until the process has ended.
+    if threading.current_thread() is threading.main_thread():
+        for number in SIGNALS:
+            signal.signal(number, stop.on_signal)
+    return stop
 
 
 # Stop request of this process, if it was started as an executable of the package.

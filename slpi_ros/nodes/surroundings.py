@@ -19,21 +19,19 @@ class SurroundingsTopics:
 
     def __init__(self, node: Node, controller: Controller) -> None:
         self._node, self._controller = node, controller
-        self._subscriptions: dict[str, tuple[str, Any]] = {}  # by quantity: full name of its topic, subscription
+        self._subscriptions: dict[str, Any] = {}  # by quantity
         self.refused: dict[str, str] = {}  # why there is none, by quantity
 
     def update(self, wanted: Sequence[str]) -> None:
         """Follow the model in use; `wanted` names topics, ``topic[:field]``, instead of those of the model."""
-        places = assigned(tuple(self._controller.surroundings), wanted)
-        for key in [key for key in self._subscriptions if key not in places]:
-            self._leave(key)
-        missing = {}
-        for key, chosen in places.items():
-            topic = self._node.resolve_topic_name(chosen.topic)
-            if key in self._subscriptions and self._subscriptions[key][0] != topic:
-                self._leave(key)
-            if key not in self._subscriptions:
-                missing[key] = topic, chosen.field
+        places = {
+            key: (self._node.resolve_topic_name(chosen.topic), chosen.field)
+            for key, chosen in assigned(tuple(self._controller.surroundings), wanted).items()
+        }
+        for key, subscription in list(self._subscriptions.items()):
+            if key not in places or places[key][0] != subscription.topic_name:
+                self._node.destroy_subscription(self._subscriptions.pop(key))
+        missing = {key: place for key, place in places.items() if key not in self._subscriptions}
         self.refused = {key: why for key, why in self.refused.items() if key in missing}
         types = dict(self._node.get_topic_names_and_types()) if missing else {}
         for key, (topic, field) in missing.items():
@@ -51,16 +49,12 @@ class SurroundingsTopics:
             return
         self.refused.pop(key, None)
         callback = partial(self._on_message, key, msgtype, field)
-        subscription = self._node.create_subscription(kind, topic, callback, MEASUREMENTS, raw=True)
-        self._subscriptions[key] = topic, subscription
+        self._subscriptions[key] = self._node.create_subscription(kind, topic, callback, MEASUREMENTS, raw=True)
 
     def _on_message(self, key: str, msgtype: str, field: str, data: bytes) -> None:
         value = value_of(data, msgtype, field)
         if value is not None:
             self._controller.surroundings.take(key, value, time.monotonic_ns())
-
-    def _leave(self, key: str) -> None:
-        self._node.destroy_subscription(self._subscriptions.pop(key)[1])
 
 
 def assigned(keys: Sequence[str], wanted: Sequence[str]) -> dict[str, Chosen]:
@@ -69,15 +63,11 @@ def assigned(keys: Sequence[str], wanted: Sequence[str]) -> dict[str, Chosen]:
     `wanted` are other places: one of the same topic and field, or topic alone, is that of its quantity; the others are
     taken in the order of the quantities that are left.
     """
-    places = {key: Chosen.of(key) for key in keys}
-    left = []
-    for text in wanted:
-        chosen = Chosen.of(text)
-        same = [key for key, own in places.items() if own == chosen or (own.topic == chosen.topic and not chosen.field)]
-        if not same:
-            left.append(chosen)
-    named = {Chosen.of(text).topic for text in wanted}
-    free = [key for key in keys if Chosen.of(key).topic not in named]
+    places, others = {key: Chosen.of(key) for key in keys}, [Chosen.of(text) for text in wanted]
+    own = {*places.values(), *(Chosen(place.topic, "") for place in places.values())}
+    left = [chosen for chosen in others if chosen not in own]
+    named = {chosen.topic for chosen in others}
+    free = [key for key in keys if places[key].topic not in named]
     for key, chosen in zip(free, left, strict=False):
         places[key] = chosen if chosen.field else Chosen(chosen.topic, places[key].field)
     return places

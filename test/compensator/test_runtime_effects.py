@@ -101,7 +101,10 @@ def test_trajectories_are_followed_as_messages_are():
     follow(made)
     expected = np.array([move(twin, k) for k in range(T.size)])
     np.testing.assert_allclose(give(made), expected, rtol=0, atol=1e-9)
-    assert made.counts.points_held == made.counts.points_slewing == 0 and made.mode is OperatingMode.STREAMING
+    assert (
+        made.counts["points_held_at_limit"] == made.counts["points_slew_limited"] == 0
+        and made.mode is OperatingMode.STREAMING
+    )
 
 
 def test_a_path_reckons_with_axes_that_another_path_brings_elsewhere():

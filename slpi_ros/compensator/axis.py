@@ -7,7 +7,7 @@ from slpi_ros.compensator.amplifier import BAND_NS, Amplifier
 from slpi_ros.compensator.feedback import LoopSettings
 from slpi_ros.compensator.loop import Loop
 from slpi_ros.compensator.model_swap import InitialState, require_near, take_over, turning_voltages, voltage_history
-from slpi_ros.compensator.motion import Brake, Idle, Kind, Motion, Ramp, following
+from slpi_ros.compensator.motion import Brake, Idle, Kind, Motion, Ramp, follow
 from slpi_ros.compensator.path_watch import PathWatch
 from slpi_ros.compensator.persistence import (
     INTERRUPTED,
@@ -31,9 +31,6 @@ from slpi_ros.model.streaming import StreamingInverse
 
 # Decimals of saved distances (m).
 KEPT_DIGITS = 10
-# Motions that setpoints have begun, in which feedback corrects; motions of the voltage without setpoints.
-SETPOINTS = frozenset({Kind.STREAM, Kind.APPROACH, Kind.HOLD})
-WITHOUT_SETPOINTS = frozenset({Kind.RAMP, Kind.RESET, Kind.BLOCK})
 
 
 class Axis:
@@ -207,7 +204,7 @@ class Axis:
     def due_ns(self) -> int | None:
         """When the next `tick` is due, steady clock; None if nothing follows."""
         due = self.motion.due_ns
-        if self.loop.active and self.motion.kind in SETPOINTS:
+        if self.loop.active and self.motion.follows:
             return self.loop.due_ns if due is None else min(due, self.loop.due_ns)
         return due
 
@@ -218,7 +215,7 @@ class Axis:
         self.held = self.slewing = False
         self.tracking.desired = None
         self.samples.restart()
-        if motion.kind in WITHOUT_SETPOINTS:
+        if motion.drives:
             self.loop.leave(self.stream)
             self.initial.assumed = None
         if isinstance(motion, Ramp):
@@ -247,7 +244,7 @@ class Axis:
     def return_inside(self, now_ns: int) -> None:
         """Go to the nearest voltage limit of the node if the voltage is outside of them."""
         outside = self.model and not self.limits.lower <= self.voltage <= self.limits.upper
-        if outside and self.motion.kind not in WITHOUT_SETPOINTS:
+        if outside and not self.motion.drives:
             self.begin(Ramp([self.limits.clip(self.voltage)], inf), now_ns)
 
     def settle(self, now_ns: int) -> None:
@@ -271,12 +268,12 @@ class Axis:
         """
         before, rate = self.voltage, self.output.rate
         if self.motion.due_ns is not None and self.motion.due_ns <= now_ns:
-            if moved and self.motion.kind in SETPOINTS:
+            if moved and self.motion.follows:
                 self.motion.due_ns = None
             else:
                 self.motion.step(self, now_ns)
         desired = self.tracking.desired
-        if self.loop.active and self.motion.kind in SETPOINTS and self.loop.due_ns <= now_ns and desired is not None:
+        if self.loop.active and self.motion.follows and self.loop.due_ns <= now_ns and desired is not None:
             v = self.loop.tick(desired, self.stream.voltage, self.stream.coupled, now_ns)
             self.amplifier.output(v, now_ns)
         return self.voltage != before or (self.output.rate != rate and self.output.limits.acceleration < inf)
@@ -295,7 +292,7 @@ class Axis:
         self.tracking.desired, self.tracking.learned = y, 0.0
         self.path.sample(dt, y)
         v = self._sample(dt, y, now_ns)
-        self.motion = following(self, now_ns, now_ns + SOONEST_HOLD_NS)
+        follow(self, now_ns, now_ns + SOONEST_HOLD_NS)
         return v
 
     def hold(self, now_ns: int) -> None:
@@ -334,8 +331,10 @@ class Axis:
         """Output and return the voltage (V) for the desired displacement `y` (m), `dt` (s) after the last step."""
         v = self._output(dt, y, self.stream.move(dt, y, now_ns), now_ns)
         self.initial.assumed, self._replaced = None, False
-        self.loop.setpoint(y, now_ns)
-        self.uncertainty.sample(dt, y, v)
+        if self.loop.closed:
+            self.loop.setpoint(y, now_ns)
+        if self.uncertainty.on:
+            self.uncertainty.sample(dt, y, v)
         return v
 
     def _output(self, dt: float, y: float, v: float, now_ns: int) -> float:
@@ -343,8 +342,10 @@ class Axis:
         stream = self.stream
         if self.loop.closed:
             v = self.loop.correct(dt, y, v, stream.coupled, now_ns)
-        self.held = stream.missed and stream.held
-        self.slewing = stream.missed and not self.held
+        self.held = self.slewing = False
+        if stream.missed:
+            self.held = stream.held
+            self.slewing = not self.held
         self.amplifier.output(v, now_ns)
         return v
 
@@ -355,7 +356,8 @@ class Axis:
         if self.model is None:
             return
         low, high = self.stream.accepted
-        x = self.loop.read(displacement, self.expected, now_ns, fresh, low <= displacement <= high)
+        expected = self.expected
+        x = self.loop.read(displacement, expected, now_ns, fresh, low <= displacement <= high)
         self.check(displacement, "measured")
         if self.initial.assumed:
             if fresh:
@@ -363,5 +365,4 @@ class Axis:
             return
         if not self.loop.closed:
             self.loop.close(self.stream, self.samples.given_ns)
-        watched = self.motion.kind not in WITHOUT_SETPOINTS
-        self.loop.measure(x, self.expected, now_ns, watched, self.tracking)
+        self.loop.measure(x, expected, now_ns, not self.motion.drives, self.tracking)

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike
 
 from slpi_ros.compensator import validation as rejection
 from slpi_ros.compensator.amplifier import STEADY_NS
-from slpi_ros.compensator.axis import WITHOUT_SETPOINTS, Axis
+from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.block import Block, BlockFollower, plan
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
 from slpi_ros.compensator.messages import Messages
@@ -136,6 +136,16 @@ class Controller:
     def voltages(self) -> "array[float]":
         """Present voltages, volts."""
         return array("d", [axis.output.voltage for axis in self.axes])
+
+    @property
+    def _following(self) -> bool:
+        """Whether all axes follow setpoints already, so that another one may come."""
+        if not self.ownership.owned or self.trajectory.on:
+            return False
+        for axis in self.axes:  # noqa: SIM110, 1 us faster than all() for each message
+            if not axis.motion.follows:
+                return False
+        return True
 
     @property
     def ramping(self) -> bool:
@@ -315,17 +325,21 @@ class Controller:
         # `arrival_ns`, on the clock of the stamps, is used instead of a `stamp_ns` of 0, or if `needs_arrival`.
         self.counts["received"] += 1
         try:
-            self._require(Kind.STREAM, now_ns)
+            following = self._following
+            if not following:
+                self._require(Kind.STREAM, now_ns)
             axes = self.messages.read(stamp_ns, names, displacements, arrival_ns)
             if not self.ownership.owned:
                 self.ownership.begin_output(now_ns)
         except RejectedError as error:
             self.counts.reject(error)
             raise
+        aheads = []
         for axis in axes:
-            axis.end_ramp(now_ns)
-        stamps = [axis.samples.stamps for axis in axes]
-        aheads = [each.accept(stamp_ns) if stamp_ns else each.arrive(arrival_ns) for each in stamps]
+            if not following:
+                axis.end_ramp(now_ns)
+            stamps = axis.samples.stamps
+            aheads.append(stamps.accept(stamp_ns) if stamp_ns else stamps.arrive(arrival_ns))
         held, slewing = self._move(axes, names, displacements, aheads, now_ns)
         self.counts.note(aheads, self.messages.jump, held, slewing)
         return held
@@ -583,7 +597,7 @@ class Controller:
         elif news:
             # The voltages are held, not the displacements: nothing follows creep or a sensor without commands.
             self.stop(StopReason.SILENCE, now_ns)
-        looked_at = [axis for axis in self.axes if axis.motion.kind not in WITHOUT_SETPOINTS]
+        looked_at = [axis for axis in self.axes if not axis.motion.drives]
         faults = [axis.loop.faulty(fault_time, now_ns) for axis in looked_at if self.ownership.owned]
         return news or any(faults)
 

@@ -35,6 +35,8 @@ class Loop:
 
     def __init__(self, settings: LoopSettings, output: RateLimiter) -> None:
         self.settings, self._output = settings, output
+        self.closed = False  # whether the total voltage is followed, because there was a reading
+        self.active = False  # whether readings correct it
         self.fault: Fault | None = None  # for which the feedback was switched off
         self.watch = SensorWatch(1.0)
         self._feedback: Feedback | None = None
@@ -44,19 +46,10 @@ class Loop:
         self._setpoint: Sensed | None = None
         self._expected: Sensed | None = None
         self._corrected_ns = 0  # begin of the last period with a correction
+        self.due_ns = 0  # when the next `tick` is due
         self.driven_ns, self._between = 0, 0.0  # last step of `applied`; time (s) of its steps without the axis
 
     # State
-
-    @property
-    def closed(self) -> bool:
-        """Whether the total voltage is followed, because there was a reading."""
-        return self._feedback is not None
-
-    @property
-    def active(self) -> bool:
-        """Whether readings correct the voltage."""
-        return self._feedback is not None and self.settings.enabled
 
     @property
     def correction(self) -> float:
@@ -78,14 +71,6 @@ class Loop:
     def drift(self) -> Drift | None:
         """Residual (measured - model) statistics; None if there are too few measurements."""
         return self._residuals.drift() if self._feedback else None
-
-    @property
-    def due_ns(self) -> int:
-        """When the next `tick` is due, steady clock: at the end of the period after that of the last correction."""
-        period_ns = self._period_ns
-        due_ns = self._corrected_ns + 2 * period_ns
-        # A voltage that moves within an acceleration limit goes on in each period.
-        return min(due_ns, self.driven_ns + period_ns) if self._output.in_motion else due_ns
 
     def applied(self, stream: StreamingInverse) -> StreamingInverse:
         """Return the inverse that follows the total voltage: that of the axis, `stream`, before the first reading."""
@@ -119,7 +104,7 @@ class Loop:
         if self.fault:
             # What the sensor told before does not count any more.
             self.watch.begin(now_ns)
-        self.settings, self.fault = settings, None
+        self.settings, self.fault, self.active = settings, None, self.closed and settings.enabled
         feedback = self._feedback
         if feedback is None:
             if settings.enabled and stream is not None:
@@ -154,7 +139,9 @@ class Loop:
         # The feedforward has a rate limiter of its own, beside that of the total voltage.
         feedback.pace, stream.pace = output, output.copy()
         self.watch.begin(now_ns)
-        self.driven_ns, self._between = now_ns, 0.0
+        self.closed, self.active = True, settings.enabled
+        self.driven_ns = self.due_ns = now_ns
+        self._between = 0.0
         if settings.enabled and not self.fault:
             feedback.enable()
 
@@ -242,6 +229,10 @@ class Loop:
             dt = MAX_DT
         v = feedback.step(y, v, now_ns, self.settings.timeout if first else None)
         self.driven_ns = now_ns
+        # At the end of the period after this one; a voltage that moves within an acceleration limit goes on in each.
+        self.due_ns = self._corrected_ns + 2 * period_ns
+        if self._output.in_motion:
+            self.due_ns = min(self.due_ns, now_ns + period_ns)
         self._expect(applied.drive(v, dt), now_ns)
         return v
 

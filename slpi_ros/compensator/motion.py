@@ -123,6 +123,12 @@ class Motion:
     """What an axis is doing: `step` does what is due at `due_ns` (steady clock; None: nothing), `end` leaves it."""
 
     kind = Kind.IDLE
+    follows = drives = False  # setpoints, so that feedback corrects; the voltage without setpoints
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        cls.follows = cls.kind in (Kind.STREAM, Kind.APPROACH, Kind.HOLD)
+        cls.drives = cls.kind in (Kind.RAMP, Kind.RESET, Kind.BLOCK)
 
     def __init__(self, due_ns: int | None = None) -> None:
         self.due_ns = due_ns
@@ -153,7 +159,7 @@ class Approach(Motion):
     def step(self, axis: Moved, now_ns: int) -> None:
         """Go on towards that voltage."""
         axis.approach(now_ns)
-        axis.motion = following(axis, now_ns, max(axis.samples.hold_ns, now_ns + axis.period_ns))
+        follow(axis, now_ns, max(axis.samples.hold_ns, now_ns + axis.period_ns))
 
 
 class Stream(Motion):
@@ -197,14 +203,19 @@ class Hold(Motion):
         self._rest, self.due_ns = None, due_ns
 
 
-def following(axis: Moved, now_ns: int, hold_ns: int) -> Motion:
-    """Return the motion after a setpoint: on to its voltage if that was held back, else wait for the next one.
+def follow(axis: Moved, now_ns: int, hold_ns: int) -> None:
+    """Begin what follows a setpoint: the way on to its voltage if that was held back, else the wait for the next one.
 
     The displacement is held from `hold_ns` on at the earliest.
     """
+    following: type[Approach | Stream] = Stream
+    due_ns = hold_ns if axis.holds else None
     if axis.slewing or axis.output.in_motion:
-        return Approach(now_ns + axis.period_ns)
-    return Stream(hold_ns if axis.holds else None)
+        following, due_ns = Approach, now_ns + axis.period_ns
+    if type(axis.motion) is following:
+        axis.motion.due_ns = due_ns
+    else:
+        axis.motion = following(due_ns)
 
 
 class Ramp(Motion):

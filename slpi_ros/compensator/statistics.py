@@ -28,12 +28,15 @@ class Counts(Counter[str]):
     def note(self, aheads: Sequence[float | None], jump: float, held: bool, slewing: bool) -> None:
         """Count an accepted message, `aheads` (s) after the last one of each axis by its stamp."""
         self["accepted"] += 1
-        self["held_at_limit"] += held
-        self["slew_limited"] += slewing
-        known = [each for each in aheads if each is not None]
-        if known:
-            self["gaps"] += max(known) > jump
-            self["time_jumps"] += min(known) < 0.0
+        if held or slewing:
+            self["held_at_limit"] += held
+            self["slew_limited"] += slewing
+        for ahead in aheads:
+            if ahead is not None and not 0.0 <= ahead <= jump:
+                known = [each for each in aheads if each is not None]
+                self["gaps"] += max(known) > jump
+                self["time_jumps"] += min(known) < 0.0
+                break
 
     def reject(self, error: RejectedError, what: str = "rejected") -> None:
         """Count a rejection of a message or a reading by its cause."""

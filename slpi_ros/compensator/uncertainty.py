@@ -27,6 +27,11 @@ class Uncertainty:
         self._t = self._waited = 0.0
 
     @property
+    def on(self) -> bool:
+        """Whether somebody asks for it."""
+        return self._streaming is not None
+
+    @property
     def present(self) -> float | None:
         """Standard uncertainty of where the axis is now, metres; None if nobody asks for it."""
         return self._streaming.present if self._streaming else None

@@ -66,6 +66,7 @@ class StreamingInverse:
         # Only the hysteresis, and what is around it: the command alone determines where the axis is.
         self._direct = not (self._before or self._behind)
         self._alone = not (chain.before or chain.own or chain.shared)
+        self.timeless = not self._streaming  # whether the model does not depend on time
         self.pace = RateLimiter(limits, MAX_DT / 2)
         self.limits = limits
         # The axis may start outside its limits; the first output voltage is inside.
@@ -108,11 +109,6 @@ class StreamingInverse:
         """Return limits, restricted to the voltages that pass the effects."""
         lower = min(max(limits.lower, self._clipped[0]), limits.upper)
         return replace(limits, lower=lower, upper=max(min(limits.upper, self._clipped[1]), lower))
-
-    @property
-    def timeless(self) -> bool:
-        """Whether the model does not depend on time."""
-        return not self._streaming
 
     @property
     def voltage(self) -> float:

@@ -9,10 +9,11 @@ from statistics import median
 from slpi_ros.compensator.amplifier import BAND_NS, Amplifier
 from slpi_ros.compensator.feedback import Drift, Feedback, LoopSettings, ResidualWindow
 from slpi_ros.compensator.model_swap import continue_from, require_near, take_over, turning_voltages, voltage_history
+from slpi_ros.compensator.monitor import Finding, Monitor
 from slpi_ros.compensator.path_watch import PathWatch
 from slpi_ros.compensator.persistence import KNOWN, RESETTING, RESTORED, MemoryConfidence, SavedAxis, Zero
 from slpi_ros.compensator.ramps import Brake, Ramp
-from slpi_ros.compensator.sensor_watch import Fault, SensorWatch
+from slpi_ros.compensator.sensor_rule import SensorRule
 from slpi_ros.compensator.statistics import TrackingStatistics
 from slpi_ros.compensator.uncertainty import UncertaintyWatch
 from slpi_ros.compensator.validation import Stamps, implausible
@@ -55,7 +56,7 @@ class Axis:
         self.name, self.place, self.limits = name, place, limits
         self.stamps = Stamps()
         self.output = RateLimiter(limits, period, limits.clip(0.0))  # the voltage, and where it may go
-        self.amplifier = Amplifier(limits.upper - limits.lower)  # what is reported of the voltage
+        self.amplifier = Amplifier(limits.upper - limits.lower, axis=name)  # what is reported of the voltage
         self.model: AxisModel | None = None
         self.confidence = MemoryConfidence()
         self.zero = Zero()
@@ -67,10 +68,11 @@ class Axis:
         self.point_ns: int | None = None  # deadline of the last trajectory point on its clock, None if it was none
         self.tracking = TrackingStatistics()  # measured - desired displacement
         self.path = PathWatch()  # desired displacements against the record of the model
-        self.fault: Fault | None = None  # for which the feedback was switched off
+        self.fault: Finding | None = None  # for which the feedback was switched off
         self._loop_settings = loop_settings
         self._feedback: Feedback | None = None
-        self._sensor_watch = SensorWatch(1.0)
+        self._sensor_rule = SensorRule(1.0, axis=name)
+        self._monitor = Monitor(self._sensor_rule)  # what switches the feedback off
         self._first_readings: deque[tuple[int, float]] = deque(maxlen=FIRST_READINGS)
         # Measured - model, with the time (ns), also where the measurement is refused.
         self._offsets: deque[tuple[int, float]] = deque(maxlen=OFFSETS)
@@ -170,7 +172,7 @@ class Axis:
         seconds = sum(effect.settling_time for effect in model.effects)
         self.amplifier.window_ns = BAND_NS + int(seconds * SECOND_NS)
         low, high = model.displacement_range
-        self._sensor_watch.span, self._sensor_watch.noise = high - low, model.quality.floor_rms
+        self._sensor_rule.span, self._sensor_rule.noise = high - low, model.quality.floor_rms
         self._sensor = model.streaming_sensor()
         self._setpoint = Sensed(self._sensor, stream.uncoupled_displacement) if self._sensor.late else None
         self._replaced = True
@@ -236,7 +238,7 @@ class Axis:
         """Replace the feedback settings without a voltage step; feedback that was switched off for a fault resumes."""
         if self.fault:
             # What the sensor told before does not count any more.
-            self._sensor_watch.begin(self.given_ns)
+            self._sensor_rule.begin(self.given_ns)
         self._loop_settings, self.fault = settings, None
         feedback = self._feedback
         if feedback is None:
@@ -422,7 +424,7 @@ class Axis:
         if expected or not self._expected:
             self._residuals.measure(x)
         if self.ramp is None and not self._in_block:
-            self._sensor_watch.read(told, x, now_ns)
+            self._monitor.read(told, x, now_ns)
         desired = self._setpoint.at(now_ns) if self._setpoint else None
         if desired is not None or not self._setpoint:
             if not self.fault:
@@ -510,12 +512,14 @@ class Axis:
             self._uncertainty_of = of
         self._uncertainty.wait((now_ns - self.given_ns) * 1e-9, self.expected, self.voltage)
 
-    def watch_sensor(self, fault_time: float, now_ns: int) -> Fault | None:
+    def watch_sensor(self, fault_time: float, now_ns: int) -> Finding | None:
         """Switch the feedback off if its sensor has been faulty for `fault_time` (s); return a new fault."""
         feedback = self._feedback
         if not (self._loop_settings.enabled and feedback and fault_time) or self.fault or self.ramp or self._in_block:
             return None
-        self.fault = self._sensor_watch.judge(now_ns, fault_time)
+        self._sensor_rule.fault_time = fault_time
+        self._monitor.check(now_ns)
+        self.fault = next(iter(self._monitor.standing), None)
         if self.fault:
             feedback.disable()
         return self.fault
@@ -561,7 +565,7 @@ class Axis:
         feedback.hold(0.0, output.voltage)
         # The feedforward has a rate limiter of its own, beside that of the total voltage.
         feedback.pace, self.stream.pace = output, output.copy()
-        self._sensor_watch.begin(self.given_ns)
+        self._sensor_rule.begin(self.given_ns)
         if settings.enabled and not self.fault:
             feedback.enable()
 

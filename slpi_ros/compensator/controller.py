@@ -13,6 +13,7 @@ from slpi_ros.compensator.amplifier import REARM_NS, STEADY_NS
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.block import Block, BlockFollower, plan
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
+from slpi_ros.compensator.monitor import Finding
 from slpi_ros.compensator.ownership import Ownership
 from slpi_ros.compensator.persistence import (
     INTERRUPTED,
@@ -25,7 +26,6 @@ from slpi_ros.compensator.persistence import (
     Zero,
 )
 from slpi_ros.compensator.ramps import Ramp, Safety
-from slpi_ros.compensator.sensor_watch import Fault
 from slpi_ros.compensator.statistics import Counts
 from slpi_ros.compensator.surroundings import Surrounding
 from slpi_ros.compensator.trajectory import CHECKED_FIRST, CHECKED_LATER, PaceCheck, Trajectory, TrajectoryExecutor
@@ -222,7 +222,7 @@ class Controller:
             axis = self._by_name.get(name)
             if axis:
                 axis.amplifier.report(voltage, now_ns)
-        if not self.ownership.lost():
+        if not self.ownership.lost(now_ns):
             return False
         self._end_reset()
         if self.mode is OperatingMode.TRAJECTORY:
@@ -351,7 +351,7 @@ class Controller:
         if rejected:
             raise rejected
 
-    def watch_sensors(self, fault_time: float, now_ns: int) -> list[tuple[Axis, Fault]]:
+    def watch_sensors(self, fault_time: float, now_ns: int) -> list[tuple[Axis, Finding]]:
         """Switch off the feedback of axes whose sensor is faulty for `fault_time` (s); return the new faults."""
         found = [(axis, axis.watch_sensor(fault_time, now_ns)) for axis in self.axes] if self.ownership.owned else []
         return [(axis, fault) for axis, fault in found if fault]
@@ -537,10 +537,11 @@ class Controller:
         block = self.block
         if self.mode is not OperatingMode.BLOCK or block is None:
             return ""
-        why = block.silent(now_ns)
-        if not why:
+        found = block.check(now_ns)
+        if not found:
             block.band(now_ns)
             return ""
+        why = found.reason
         self._end_block(now_ns)
         if block.state:
             # It may still be moving.

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from slpi_ros.compensator.amplifier import MUTE_NS, STEADY_NS
 from slpi_ros.compensator.axis import Axis
+from slpi_ros.compensator.monitor import Monitor
 from slpi_ros.compensator.validation import NOT_ARMED, STARTING, RejectedError
 from slpi_ros.model.limits import volts
 
@@ -21,6 +22,7 @@ class Ownership:
         self.reporting = self.started = False  # ``stage_state`` has a publisher; a voltage was output
         self.obstacle: tuple[str, str] | None = None  # cause and reason why no voltage may be output
         self.notes: dict[str, str] = {}  # by axis: what is not certain about the voltage at the start
+        self.monitor = Monitor(*(axis.amplifier for axis in axes))  # what it finds stops the output until `arm`
         self._axes = axes
         self._starts = list(starts) or [AUTO] * len(axes)  # `AUTO`, `MEASURED`, `SAVED`, or volts
         self._since_ns, self._ever = 0, False
@@ -95,13 +97,13 @@ class Ownership:
             for axis in self._axes:
                 self._take(axis, now_ns)
 
-    def lost(self) -> bool:
+    def lost(self, now_ns: int) -> bool:
         """Return whether somebody else has begun to move an axis; nothing may then be output until `arm`."""
-        for axis in self._axes:
-            if axis.amplifier.foreign and self.armed:
-                self.obstacle = NOT_ARMED, f"axis '{axis.name}': {axis.amplifier.foreign}"
-                return True
-        return False
+        self.monitor.check(now_ns)
+        if not (self.monitor.standing and self.armed):
+            return False
+        self.obstacle = NOT_ARMED, str(self.monitor.standing[0])
+        return True
 
     def arm(self, now_ns: int, steady_ns: int = STEADY_NS) -> str:
         """Continue from the steady voltages that are reported; return the reason if there are none, else ""."""

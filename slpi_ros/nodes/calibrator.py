@@ -14,7 +14,7 @@ from std_msgs.msg import String
 from std_srvs.srv import Trigger
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.calibration.drive_watch import FARTHEST
+from slpi_ros.calibration.drive_monitor import FARTHEST
 from slpi_ros.calibration.run import Progress
 from slpi_ros.calibration.settings import CalibrationSettings
 from slpi_ros.errors import RecordError, SlpiError, UsageError, length
@@ -186,7 +186,7 @@ class Calibrator(Node):
     ``report.html`` and the last diagnosis.
 
     Nothing is moved while stage_state is missing or another node publishes voltages. If stage_state reports what the
-    voltages cannot have caused (`slpi_ros.calibration.drive_watch`), another publisher appears or a bag cannot be
+    voltages cannot have caused (`slpi_ros.calibration.drive_monitor`), another publisher appears or a bag cannot be
     written, the voltages return to rest within the limits. An interrupted drive is kept as ``interrupted_NAME``.
     """
 

@@ -133,7 +133,7 @@ class Exciter(Node):
     earlier would not hold the memory at its end.
 
     It drives only while no other node publishes the topic of its voltages, and while ``stage_state`` reports what the
-    voltages can have caused (`slpi_ros.calibration.drive_watch`). Else it returns to rest at the slew limit and ends
+    voltages can have caused (`slpi_ros.calibration.drive_monitor`). Else it returns to rest at the slew limit and ends
     with exit code 1 (without ``autostart`` it stays). A trajectory is not watched: the device plays it by itself.
     Services ``~/start`` and ``~/stop`` (std_srvs/Trigger); parameters in `DECLARATIONS`.
     """

@@ -13,7 +13,7 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from slpi_ros.calibration.drive_watch import DriveWatch
+from slpi_ros.calibration.drive_monitor import DriveMonitor
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
 from slpi_ros.effects.excitation import MEAN_SPEED
 from slpi_ros.errors import RecordError, SlpiError
@@ -60,7 +60,7 @@ class GuardedDrive:
         self._limiters = [RateLimiter(each, 1.0 / self._rate) for each in limits]
         self._started = False
         self._since_ns = time.monotonic_ns()
-        self.watch = DriveWatch(self._axes, limits, self._timeout, simulated=self._simulated)
+        self.watch = DriveMonitor(self._axes, limits, self._timeout, simulated=self._simulated)
 
     @property
     def voltages(self) -> list[float]:

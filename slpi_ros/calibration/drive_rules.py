@@ -48,7 +48,7 @@ class RelationLimits:
     same_move: float = 0.05  # unless they are the lowest or highest so far, or the resolution is coarse
     frozen: FollowingLimits = FollowingLimits(stuck=0.05, error=0.1, inverted=-inf, late=0.33, shifts=12)
     flipped: FollowingLimits = FollowingLimits(stuck=-inf, inverted=-0.25, errors=4.0, late=0.33, shifts=12)
-    judged_ns: int = 3 * SECOND_NS // 100  # between two judgements of a slope
+    judged_ns: int = SECOND_NS // 40  # between two judgements of a slope
 
 
 class StampRule(Rule):

@@ -35,7 +35,8 @@ from slpi_ros.nodes.common import (
     request_stop,
 )
 from slpi_ros.nodes.device_block import BlockPlayer, BlockRequest, BlockState, Told
-from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings, State
+from slpi_ros.nodes.device_link import State
+from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
 
 VOLTAGE = (-10_000.0, 10_000.0)
@@ -241,7 +242,7 @@ class Driver(Node):
             )
 
     def _on_trajectory(self, data: bytes) -> None:
-        self._loop.submit(_read_block(data))
+        self._loop.blocks.submit(_read_block(data))
 
     def _tell_block(self, state: BlockState) -> None:
         seconds, rest = divmod(state.stamp_ns, SECOND_NS)
@@ -281,10 +282,10 @@ class Driver(Node):
         while self._loop.answers:
             what, success, text = self._loop.answers.popleft()
             self._deferred[what].answer(success, text)
-        while self._loop.block_states:
-            self._tell_block(self._loop.block_states.popleft())
-        while self._loop.recorded:
-            self._publish_recording(self._loop.recorded.popleft())
+        while self._loop.blocks.states:
+            self._tell_block(self._loop.blocks.states.popleft())
+        while self._loop.blocks.recorded:
+            self._publish_recording(self._loop.blocks.recorded.popleft())
         status, now = self._loop.status, time.monotonic()
         changed = status.state is not self._told.state
         if changed:

@@ -12,7 +12,8 @@ from drivers.kinds import KINDS
 from slpi_ros.drivers import gcs_waves, labjack, nidaqmx, stream
 from slpi_ros.model.limits import Limits
 from slpi_ros.nodes.device_block import BlockRequest, Told
-from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings, State
+from slpi_ros.nodes.device_link import State
+from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings
 from slpi_ros.simulation.devices.base import LOST, SILENT, Fault
 
 RATE, SLEW = 500.0, 2000.0
@@ -29,7 +30,7 @@ class Bench:
         given = LoopSettings(axes, (Limits(0.0, 100.0, SLEW),) * len(axes), RATE, **settings)
         self.axes = axes
         self.loop = DeviceLoop(kind.make(simulator), given, self.readings.append, self.now_ns)
-        self.loop.block_states = self.states
+        self.loop.blocks.states = self.states
 
     def now_ns(self):
         return time.monotonic_ns() if self._now_ns is None else self._now_ns
@@ -58,7 +59,7 @@ class Bench:
     def submit(self, voltages, period, names=None, stamp=7):
         voltages = np.asarray(voltages, float)
         times = np.round(np.arange(len(voltages)) * period * 1e9).astype(np.int64)
-        self.loop.submit(BlockRequest(stamp, names or self.axes[: voltages.shape[1]], times, voltages))
+        self.loop.blocks.submit(BlockRequest(stamp, names or self.axes[: voltages.shape[1]], times, voltages))
 
     def path(self, place=0):
         axis = self.simulator.axes[place]
@@ -95,7 +96,7 @@ def test_a_device_plays_a_block_by_its_clock_bit_for_bit(bench, count):
     period = 5e-5
     v = wave(count, period, 20.0, 30.0)
     bench.submit(v, period)
-    bench.until(lambda: bench.loop.recorded)
+    bench.until(lambda: bench.loop.blocks.recorded)
     assert bench.told[:2] == [Told.ACCEPTED, Told.PLAYING] and bench.told[-1] is Told.ENDED
     assert bench.states[-1].sample == count and {state.stamp_ns for state in bench.states} == {7}
     for place, axis in enumerate(bench.simulator.axes):
@@ -104,7 +105,7 @@ def test_a_device_plays_a_block_by_its_clock_bit_for_bit(bench, count):
         np.testing.assert_array_equal([each.voltage for each in played], v[changed, place] * (1.0 / bench.kind.gain))
         times = np.array([each.time_ns for each in played])
         np.testing.assert_array_equal(times - times[0], (changed - changed[0]) * 50_000)
-    recording = bench.loop.recorded[0].recording
+    recording = bench.loop.blocks.recorded[0].recording
     np.testing.assert_allclose(recording.times, np.arange(count) * period, atol=1e-12)
     np.testing.assert_allclose(recording.voltages, v, atol=1e-8)
     # The positions are those of the simulated stage, and the states went on meanwhile.
@@ -125,11 +126,11 @@ def test_a_device_plays_a_block_by_its_clock_bit_for_bit(bench, count):
 def test_where_a_device_cannot_it_is_streamed(bench):
     v = wave(200, 2e-3, 20.0, 30.0)
     bench.submit(v, 2e-3)
-    bench.until(lambda: bench.loop.recorded)
+    bench.until(lambda: bench.loop.blocks.recorded)
     assert bench.told[-1] is Told.ENDED and "streamed" in bench.states[0].reason
     assert bench.largest_step <= SLEW * 2.0 / RATE
     np.testing.assert_allclose(bench.path()[-1], v[-1, 0], atol=1e-4)
-    recording = bench.loop.recorded[0].recording
+    recording = bench.loop.blocks.recorded[0].recording
     assert np.ptp(recording.positions[:, 1]) > 1e-7
 
 
@@ -157,7 +158,7 @@ def test_what_is_refused_moves_nothing(bench, voltages, names, named):
 
 @pytest.mark.parametrize("bench", [("gcs", 2, [20.0, 30.0], False)], indirect=True)
 def test_times_that_do_not_increase(bench):
-    bench.loop.submit(BlockRequest(7, ("a0",), np.array([0, 0]), np.array([[20.0], [20.0]])))
+    bench.loop.blocks.submit(BlockRequest(7, ("a0",), np.array([0, 0]), np.array([[20.0], [20.0]])))
     bench.turn(2)
     assert bench.told == [Told.REFUSED]
 

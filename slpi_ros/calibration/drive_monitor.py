@@ -34,9 +34,7 @@ class DriveMonitor:
         self._axes = tuple(axes)
         self._stamps, self._states = StampRule(JUMP_SIMULATED if simulated else JUMP), StateRule(timeout)
         voltages = VoltageLimits(window_ns=int(LATE * timeout * SECOND_NS), then="")
-        self._amplifiers = [
-            Amplifier(each.upper - each.lower, voltages, axis) for axis, each in zip(axes, limits, strict=True)
-        ]
+        self._amplifiers = [Amplifier(each.span, voltages, axis) for axis, each in zip(axes, limits, strict=True)]
         self._relations = [RelationRule(each, axis) for axis, each in zip(axes, limits, strict=True)]
         self._each = [Monitor(*rules) for rules in zip(self._amplifiers, self._relations, strict=True)]
         self._monitors = (Monitor(self._stamps), *self._each, Monitor(self._states))

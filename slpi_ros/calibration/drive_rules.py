@@ -137,12 +137,8 @@ class _Known:
     noise: float = 0.0
     quantum: float = 0.0
 
-    @property
-    def span(self) -> float:
-        return self.limits.upper - self.limits.lower
-
     def cell(self, v: float) -> int:
-        return min(max(int((v - self.limits.lower) / self.span * CELLS), 0), CELLS - 1)
+        return min(max(int((v - self.limits.lower) / self.limits.span * CELLS), 0), CELLS - 1)
 
     def learn(self, v: float, y: float) -> None:
         at = self.cell(v)
@@ -167,7 +163,7 @@ class _Known:
         off = rule.off * (float(self.high[known].max()) - float(self.low[known].min()))
         off += rule.off_noises * self.noise + rule.off_quanta * self.quantum
         lowest, highest = float(self.low[near].min()) - off, float(self.high[near].max()) + off
-        width = self.span / CELLS
+        width = self.limits.span / CELLS
         beyond_up, beyond_down = max(last - int(known[-1]), 0) * width, max(int(known[0]) - first, 0) * width
         ways = (rule.steepest * self.slope * beyond_up, -rule.steepest * self.slope * beyond_down)
         return lowest + min(0.0, *ways), highest + max(0.0, *ways)
@@ -233,11 +229,11 @@ class RelationRule(Rule):
         count, low, high = count + 1, min(low, v), max(high, v)
         self._same = y, count, low, high
         fine = known.noise and not known.quantum and known.low.min() < y < known.high.max()
-        if fine and count >= rule.same and high - low > rule.same_move * known.span:
+        if fine and count >= rule.same and high - low > rule.same_move * known.limits.span:
             self._find(
                 "frozen",
                 f"reads {y * 1e6:.6g} µm in {count} states while the voltage moved by {high - low:.3g} V (limit "
-                f"{rule.same_move * known.span:.3g} V); check the sensor",
+                f"{rule.same_move * known.limits.span:.3g} V); check the sensor",
             )
 
     def _is_outside(self, y: float, now_ns: int) -> bool:
@@ -279,7 +275,7 @@ class RelationRule(Rule):
 
     def _window(self, v: FloatArray, t: FloatArray, ends: float, move: float) -> int:
         """Return the first reading of the shortest window up to now in which the voltage moved enough; -1 if none."""
-        limits, span = self._known.limits, self._known.span
+        limits, span = self._known.limits, self._known.limits.span
         inside = np.clip(v, limits.lower + ends * span, limits.upper - ends * span)[::-1]
         ranges = np.maximum.accumulate(inside) - np.minimum.accumulate(inside)
         enough = (ranges >= move * span) & (t[-1] - t[::-1] >= self._rule.window)

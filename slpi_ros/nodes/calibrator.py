@@ -3,7 +3,6 @@
 import math
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -111,22 +110,53 @@ class Interrupted(SlpiError):
     """The calibration was ended before its end: by a request, a signal or a fault."""
 
 
-@dataclass
 class _Job:
-    """A drive on its way: its place in drive time, its bag, and the readings that are still to come, seconds."""
+    """A drive on its way, and its bag in a folder: what is commanded at its present time, and the readings of it."""
 
-    wanted: Wanted
-    bag: BagWriter
-    at: float = 0.0
-    tail: float = TAIL
+    def __init__(self, wanted: Wanted, output: Path) -> None:
+        self.wanted, self._bag = wanted, BagWriter(output / wanted.name, topic=f"/{STATE}")
+        if wanted.desired.size:
+            self._bag.add_topic(PATH)
+        self._at, self._tail = 0.0, TAIL  # time in the drive, and for the last readings to arrive; seconds
 
     def goals(self) -> list[float]:
         """Return the voltages (V) of the drive at its present time."""
-        return [float(np.interp(self.at, self.wanted.t, v)) for v in self.wanted.voltage.T]
+        return [float(np.interp(self._at, self.wanted.t, v)) for v in self.wanted.voltage.T]
 
     def desired(self) -> list[float]:
-        """Return the desired displacements (m) at the present time, NaN if there are none."""
-        return [float(np.interp(self.at, self.wanted.t, y)) for y in self.wanted.desired.T]
+        """Return the desired displacements (m) at the present time."""
+        return [float(np.interp(self._at, self.wanted.t, y)) for y in self.wanted.desired.T]
+
+    def advance(self, dt: float) -> None:
+        """Go on by a time (s)."""
+        if self._at >= self.wanted.t[-1]:
+            self._tail -= dt
+        self._at += dt
+
+    @property
+    def done(self) -> bool:
+        """Whether the drive and its last readings are over."""
+        return self._tail <= 0.0
+
+    def write(self, stamp: int, message: bytes, topic: str) -> None:
+        """Record a message; RecordError if that fails."""
+        try:
+            self._bag.write(stamp, message, topic)
+        except RecordError as error:
+            raise RecordError(f"{error}; its unfinished files are in {self._bag.partial}") from error
+
+    def close(self, *, interrupted: bool) -> None:
+        """Complete the bag, and set it aside if the drive was interrupted; RecordError if that fails or it is empty."""
+        path = self._bag.path
+        try:
+            if not self._bag.message_count:
+                self._bag.discard()
+                raise RecordError(f"calibrator: no {STATE} during {self.wanted.name}")
+            self._bag.close()
+            if interrupted:
+                path.rename(_free(path.with_name(f"interrupted_{path.name}")))
+        except OSError as error:
+            raise RecordError(str(error)) from error
 
 
 def settings_of(values: Values) -> CalibrationSettings:
@@ -192,27 +222,22 @@ class Calibrator(Node):
 
     def __init__(self) -> None:
         super().__init__("calibrator")
-        self._parameter_set = Parameters(self, DECLARATIONS, lambda values: dict(values))
-        values = self._parameter_set.settings
+        values = Parameters(self, DECLARATIONS, lambda values: dict(values)).settings
         self._settings = settings = settings_of(values)
-        self._output = Path(values["output"]).absolute()
+        self._output, self._patience = Path(values["output"]).absolute(), float(values["patience"])
         _prepare(self._output, resume=values["resume"])
-        self._timeout, self._patience = float(values["state_timeout"]), float(values["patience"])
         self._guard = GuardedDrive(
-            self, settings.axes, settings.limits, settings.rate, self._timeout, on_state=self._on_state
+            self, settings.axes, settings.limits, settings.rate, values["state_timeout"], on_state=self._on_state
         )
-        self._goals = list(settings.rest)
         self._job: _Job | None = None
         self._worker: CalibrationJob | None = None
         self._failure: SlpiError | None = None
         self._outcome: CalibrationOutcome | None = None
         self._progress: Progress | None = None
         self._returning = self._paused = False
-        self._begun = self._held = self._stepped = self._moved = time.monotonic()
-        self._said = -math.inf
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        simulated = self.get_parameter("use_sim_time").value
-        self._drive_clock = self.get_clock() if simulated else self._steady
+        self._begun = self._stepped = self._moved = time.monotonic()
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._drive_clock = self.get_clock() if self.get_parameter("use_sim_time").value else steady
         self._step_ns = 0
         self._models = self.create_publisher(String, "stage_model", LATCHED)
         self._diagnostics = Diagnostics(self, "calibrator")
@@ -222,8 +247,8 @@ class Calibrator(Node):
         period = 1.0 / settings.rate
         # A simulated clock drives a simulated stage; the watch goes on if it stops.
         self.create_timer(period, self._step, clock=self._drive_clock)
-        self.create_timer(period, self._watch, clock=self._steady)
-        self.create_timer(REPORT_PERIOD, self._report, clock=self._steady)
+        self.create_timer(period, self._watch, clock=steady)
+        self.create_timer(REPORT_PERIOD, self._report, clock=steady)
 
     def destroy_node(self) -> None:
         """Return to rest, keep what was recorded, then destroy the node; Interrupted if a signal ended the run."""
@@ -257,12 +282,8 @@ class Calibrator(Node):
             self._outcome = worker.outcome()
 
     def _begin_job(self, wanted: Wanted) -> None:
-        bag = BagWriter(self._output / wanted.name, topic=f"/{STATE}")
-        if wanted.desired.size:
-            bag.add_topic(PATH)
-        self._stepped = time.monotonic()
+        self._job, self._stepped = _Job(wanted, self._output), time.monotonic()
         self._guard.begin()
-        self._job = _Job(wanted, bag)
 
     # Drives
 
@@ -275,35 +296,24 @@ class Calibrator(Node):
             self._stepped = time.monotonic()
         if self._returning or job is None or elapsed <= 0.0:
             return
-        dt = min(elapsed, MOST_PERIODS / self._settings.rate)
         if not self._paused:
-            job.at += dt
-            self._goals = job.goals()
-        self._move()
-        if job.wanted.desired.size and not self._paused:
-            self._keep_desired(job)
-        if job.at >= job.wanted.t[-1] and not self._paused:
-            job.tail -= dt
-            if job.tail <= 0.0:
-                self._end_job()
-
-    def _move(self) -> None:
-        self._guard.move(self._goals)
-        self._held = time.monotonic()
-
-    def _keep_desired(self, job: _Job) -> None:
-        """Record desired displacement and command, stamped as they are sent."""
-        stamp = self.get_clock().now().nanoseconds
-        message = encode_joint_states(
-            np.array([stamp]), np.array([job.desired()]), np.array([self._guard.voltages]), self._settings.axes
-        )[0]
-        self._write(job, stamp, message, PATH)
+            job.advance(min(elapsed, MOST_PERIODS / self._settings.rate))
+        self._guard.move(job.goals())
+        if self._paused:
+            return
+        if job.wanted.desired.size:
+            # Desired displacement and command, stamped as they are sent.
+            stamp = self.get_clock().now().nanoseconds
+            values = np.array([job.desired()]), np.array([self._guard.voltages])
+            self._write(job, stamp, encode_joint_states(np.array([stamp]), *values, self._settings.axes)[0], PATH)
+        if job.done:
+            self._end_job()
 
     def _write(self, job: _Job, stamp: int, message: bytes, topic: str) -> None:
         try:
-            job.bag.write(stamp, message, topic)
+            job.write(stamp, message, topic)
         except RecordError as error:
-            self._fail(RecordError(f"{error}; its unfinished files are in {job.bag.partial}"))
+            self._fail(error)
 
     def _end_job(self) -> None:
         """Complete the bag of the job, and tell the calibration."""
@@ -311,35 +321,25 @@ class Calibrator(Node):
         if job is None:
             return
         self._guard.end()
-        failure = self._failure
         try:
-            if job.bag.message_count:
-                job.bag.close()
-                if failure is not None:
-                    job.bag.path.rename(_free(job.bag.path.with_name(f"interrupted_{job.bag.path.name}")))
-            else:
-                job.bag.discard()
-                failure = failure or RecordError(f"calibrator: no {STATE} during {job.wanted.name}")
-        except (RecordError, OSError) as error:
-            failure = failure or RecordError(f"{error}; {RESUME}")
-        if failure is not None:
-            self._fail(failure)
-        elif self._worker is not None:
+            job.close(interrupted=self._failure is not None)
+        except RecordError as error:
+            self._fail(error)
+        if self._failure is None and self._worker is not None:
             self._worker.recorded()
 
     # What is watched
 
     def _watch(self) -> None:
         """Check the stage once a period, and step the return to rest, on a clock that does not stop."""
-        now = time.monotonic()
+        now, rest = time.monotonic(), self._settings.rest
         self._guard.listen()
         fault = self._guard.fault() if self._job is not None or self._waiting else None
         if self._returning:
-            if not self._guard.return_step(self._settings.rest):
+            if not self._guard.return_step(rest):
                 self._moved = now
-            self._goals, self._held = list(self._settings.rest), now
             # States of the return still arrive for a while, on a busy machine for longer.
-            self._returning = now - self._moved < (TAIL if self._guard.reports(self._settings.rest) else LATEST)
+            self._returning = not self._guard.settled(rest, self._moved, TAIL, LATEST)
         elif self._failure is not None:
             self._end_job()
             request_stop(self._failure)
@@ -347,26 +347,20 @@ class Calibrator(Node):
             self._finish(self._outcome)
         elif self._waiting:
             self._start_when_ready(now)
-        elif self._job is not None:
-            if now - self._stepped > self._patience:
-                fault = RecordError(f"calibrator: time stands still for {self._patience:g} s; check /clock")
-            if fault is not None:
-                self._fail(fault)
-        else:
+        elif self._job is None:
             self._listen_to_worker()
-        if self._guard.started and now - self._held > HOLD_PERIOD:
-            # A stage that answers commands goes on reporting.
-            self._move()
+        elif now - self._stepped > self._patience:
+            self._fail(RecordError(f"calibrator: time stands still for {self._patience:g} s; check /clock"))
+        elif fault is not None:
+            self._fail(fault)
+        self._guard.hold(HOLD_PERIOD)
 
     def _start_when_ready(self, now: float) -> None:
         """Start once the stage reports and somebody takes the voltages; fail if that lasts too long."""
-        lacking = self._guard.lacking()
-        late = now - self._begun > self._patience
-        found = None if lacking else self._guard.found()
         # A publisher that was killed is known for some seconds more.
-        if self._guard.others and not late:
-            lacking = f"{self._guard.told_others()}; stop it"
-        if found is not None and not self._guard.others:
+        lacking, company = self._guard.lacking(), self._guard.company()
+        found = None if lacking or company else self._guard.found()
+        if found is not None:
             self._waiting = False
             try:
                 self._guard.start(found)
@@ -375,15 +369,13 @@ class Calibrator(Node):
                 return
             self._returning, self._moved = True, now
             self._worker = CalibrationJob(self._settings, self._output)
-        elif late:
-            try:
-                self._guard.require_alone()
-                self._fail(RecordError(f"calibrator: for {self._patience:g} s {lacking}"))
-            except RecordError as error:
-                self._fail(error)
-        elif now - self._said > LOG_PERIOD and now - self._begun > HOLD_PERIOD:
-            self._said = now
-            self.get_logger().info(f"waiting, {self._patience:g} s at most: {lacking}")
+        elif now - self._begun > self._patience:
+            self._fail(self._guard.not_alone() or RecordError(f"calibrator: for {self._patience:g} s {lacking}"))
+        elif now - self._begun > HOLD_PERIOD:
+            lacking = f"{company}; stop it" if company else lacking
+            self.get_logger().info(
+                f"waiting, {self._patience:g} s at most: {lacking}", throttle_duration_sec=LOG_PERIOD
+            )
 
     def _on_state(self, data: bytes, clock_ns: int) -> None:
         """Record a state if a drive is on its way."""

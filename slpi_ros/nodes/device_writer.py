@@ -1,14 +1,12 @@
 """The voltages of a device: the last limits before the wire, and whether the device says that it follows."""
 
-import math
 from collections.abc import Sequence
 
 from slpi_ros.compensator.amplifier import Amplifier, VoltageLimits
 from slpi_ros.compensator.monitor import Monitor
 from slpi_ros.drivers.base import Reading
-from slpi_ros.effects.excitation import MEAN_SPEED
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.model.limits import Limits, RateLimiter
+from slpi_ros.model.limits import Limits, StageLimiter
 
 # The commands are told to be held at a limit for this time.
 HELD_NS = SECOND_NS
@@ -28,27 +26,25 @@ REPORTED = VoltageLimits(
 class Writer:
     """Moves the voltages of a device from where they are to a goal, within the limits; what it says goes to `monitor`.
 
-    `goal` is of the last command, V, None: none; `written` what the device has or was given last.
+    `goal` is of the last command, V, None: none.
     """
 
     def __init__(self, axes: Sequence[str], limits: Sequence[Limits], period: float) -> None:
         self.goal: tuple[float, ...] | None = None
-        self.written: tuple[float, ...] = ()
         self._axes, self._limits = axes, limits
-        self._limiters = [RateLimiter(each, period) for each in limits]
+        self._limiter = StageLimiter(limits, period)
         self._limited_ns = [-(1 << 62)] * len(limits)
-        # At the end there is always a slew limit.
-        self._gentle = [math.inf if each.slew < math.inf else MEAN_SPEED * (each.upper - each.lower) for each in limits]
-        self._reports = [
-            Amplifier(each.upper - each.lower, REPORTED, axis) for axis, each in zip(axes, limits, strict=True)
-        ]
+        self._reports = [Amplifier(each.span, REPORTED, axis) for axis, each in zip(axes, limits, strict=True)]
         self.monitor = Monitor(*self._reports)
+
+    @property
+    def written(self) -> tuple[float, ...]:
+        """Voltages that were written last, or that the device had at the start, volts."""
+        return self._limiter.voltages
 
     def start(self, voltages: tuple[float, ...], offsets: Sequence[float] = ()) -> None:
         """Go on from voltages (V) that the device has; it may report others by offsets (V; none: as before)."""
-        for limiter, v in zip(self._limiters, voltages, strict=True):
-            limiter.start(v)
-        self.written = voltages
+        self._limiter.start(voltages)
         for rule, v in zip(self._reports, voltages, strict=True):
             rule.begin(v, 0)
         for rule, offset in zip(self._reports, offsets, strict=False):
@@ -56,16 +52,12 @@ class Writer:
 
     def step(self, goal: tuple[float, ...], now_ns: int, *, gently: bool = False) -> tuple[float, ...] | None:
         """Return the voltages (V) to write on the way to a goal (V); None if they were written last."""
-        fastest = self._gentle if gently else [math.inf] * len(goal)
-        wanted = tuple(
-            limiter.step(v, now_ns, rate) for limiter, v, rate in zip(self._limiters, goal, fastest, strict=True)
-        )
+        before, wanted = self.written, self._limiter.step(goal, now_ns, gently=gently)
         for place, (v, limits) in enumerate(zip(goal, self._limits, strict=True)):
             if not limits.lower <= v <= limits.upper:
                 self._limited_ns[place] = now_ns
-        if wanted == self.written:
+        if wanted == before:
             return None
-        self.written = wanted
         for rule, v in zip(self._reports, wanted, strict=True):
             rule.output(v, now_ns)
         return wanted

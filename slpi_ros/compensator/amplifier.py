@@ -19,14 +19,12 @@ REPORTS, MOST_REPORTS, REPORT_AGE_NS, SLOW_NS = 3, 5, SECOND_NS // 5, SECOND_NS
 MUTE_NS = 3 * SECOND_NS
 # Reports are compared with the voltages of this time, and of the settling time of the stage's effects.
 BAND_NS = SECOND_NS // 5
-# They may be off by this share of the voltage range, or by this many times their noise.
-TOLERATED_SHARE, TOLERATED_NOISES = 0.02, 4.0
+# They may be off by this share of the voltage range.
+TOLERATED_SHARE = 0.02
 # This many reports over this time outside: the voltage is another one.
 FOREIGN_REPORTS, FOREIGN_NS = 3, SECOND_NS // 10
 # Reports are steady if they stay within the tolerance for this time; a rearming node waits longer.
 STEADY_NS, REARM_NS = SECOND_NS // 5, SECOND_NS // 2
-# A voltage of this many ranges is none, in whatever unit.
-ABSURD = 1e4
 # Voltages are kept in pieces of this length.
 PIECE_NS = SECOND_NS // 100
 # A gain or an offset of the reports is one that explains this share of them, and of those while the voltage moved;
@@ -64,10 +62,11 @@ class VoltageLimits:
     """When reports contradict the voltages that were output, and what is said then."""
 
     share: float = TOLERATED_SHARE  # further off than this share of the voltage range,
-    noises: float = TOLERATED_NOISES  # and than this many times the noise of the reports,
+    noises: float = 4.0  # and than this many times the noise of the reports,
     reports: int = FOREIGN_REPORTS  # this many of them
     lasts_ns: int = FOREIGN_NS  # over this time
     window_ns: int = BAND_NS  # for this time an output voltage may still be reported
+    absurd: float = 1e4  # a report beyond this many ranges is none, in whatever unit
     calibrated: bool = True  # a constant gain or offset that explains the reports is calibration, and no contradiction
     reason: str = (  # of {reported} V, where {there}, the last time {last} V
         "stage_state reports {reported} V (effort), but {there}: somebody else moves the stage, its driver limits the "
@@ -159,7 +158,7 @@ class Amplifier(Rule):
 
     def report(self, voltage: float, now_ns: int) -> None:
         """Take a reported voltage (V) that arrived at `now_ns`; one that is not finite or absurd is no report."""
-        if not (isfinite(voltage) and abs(voltage) <= ABSURD * self.span):
+        if not (isfinite(voltage) and abs(voltage) <= self.limits.absurd * self.span):
             return
         before = self.latest
         self._reports.append((now_ns, voltage))

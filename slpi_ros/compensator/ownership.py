@@ -107,17 +107,15 @@ class Ownership:
 
     def arm(self, now_ns: int, steady_ns: int = STEADY_NS) -> str:
         """Continue from the steady voltages that are reported; return the reason if there are none, else ""."""
-        found = {axis.name: axis.amplifier.steady(now_ns, steady_ns) for axis in self._axes}
-        for name, voltage in found.items():
+        found: list[float] = []
+        for axis in self._axes:
+            voltage = axis.amplifier.steady(now_ns, steady_ns)
             if voltage is None:
-                return f"axis '{name}': stage_state reports no steady voltage (effort); stop what moves the stage"
-        for axis in self._axes:
-            voltage = found[axis.name]
-            if voltage is not None and not self._possible(axis, voltage):
+                return f"axis '{axis.name}': stage_state reports no steady voltage (effort); stop what moves the stage"
+            if not self._possible(axis, voltage):
                 return f"axis '{axis.name}': {self._impossible(voltage)}"
-        for axis in self._axes:
-            voltage = found[axis.name]
-            assert voltage is not None
+            found.append(voltage)
+        for axis, voltage in zip(self._axes, found, strict=True):
             # The last output of an axis that nobody moved is known better than a noisy report of it.
             if axis.amplifier.foreign or abs(voltage - axis.voltage) > axis.amplifier.scatter:
                 axis.locate(voltage)

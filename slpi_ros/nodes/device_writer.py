@@ -1,6 +1,7 @@
 """The voltages of a device: the last limits before the wire, and whether the device says that it follows."""
 
 from collections.abc import Sequence
+from math import inf
 
 from slpi_ros.compensator.amplifier import Amplifier, VoltageLimits
 from slpi_ros.compensator.monitor import Monitor
@@ -15,6 +16,7 @@ ROUNDING = 1e-6
 # A device reports the voltage that was written within this time; a gain or an offset of it is no calibration here.
 REPORTED = VoltageLimits(
     window_ns=3 * SECOND_NS // 10,
+    absurd=inf,
     calibrated=False,
     reason=(
         "is at {reported} V, but {last} V was written: the device limits the voltage, its command is not in volts, or "

@@ -45,6 +45,11 @@ def test_a_voltage_that_was_not_written_is_found_after_three_reports_and_a_tenth
     assert followed(made, (20.0, 35.0), lambda v: v) == (None, "")
 
 
+def test_a_voltage_in_whatever_unit_counts():
+    cycle, found = followed(writer_at(20.0), (20.0,), lambda v: (1e9,))
+    assert cycle == 100 and "1e+09 V" in found
+
+
 def test_a_constant_gain_is_no_calibration_here():
     assert "volts" in followed(writer_at(0.0), (60.0,), lambda v: (0.25 * v[0],))[1]
 

@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,7 @@ from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.bag_files import partial_path
 from slpi_ros.io.bag_writer import BagWriter
 from slpi_ros.io.desired import read_path
-from slpi_ros.io.messages import encode_joint_states
+from slpi_ros.io.messages import JointStateEncoder
 from slpi_ros.model.limits import Limits
 from slpi_ros.nodes.calibration_job import PATH, STATE, CalibrationJob, CalibrationOutcome, Wanted
 from slpi_ros.nodes.common import LATCHED, WARN, Diagnostics, Health, request_stop
@@ -113,8 +113,9 @@ class Interrupted(SlpiError):
 class _Job:
     """A drive on its way, and its bag in a folder: what is commanded at its present time, and the readings of it."""
 
-    def __init__(self, wanted: Wanted, output: Path) -> None:
+    def __init__(self, wanted: Wanted, output: Path, axes: Sequence[str]) -> None:
         self.wanted, self._bag = wanted, BagWriter(output / wanted.name, topic=f"/{STATE}")
+        self._encoder = JointStateEncoder(axes, "")
         if wanted.desired.size:
             self._bag.add_topic(PATH)
         self._at, self._tail = 0.0, TAIL  # time in the drive, and for the last readings to arrive; seconds
@@ -122,10 +123,6 @@ class _Job:
     def goals(self) -> list[float]:
         """Return the voltages (V) of the drive at its present time."""
         return [float(np.interp(self._at, self.wanted.t, v)) for v in self.wanted.voltage.T]
-
-    def desired(self) -> list[float]:
-        """Return the desired displacements (m) at the present time."""
-        return [float(np.interp(self._at, self.wanted.t, y)) for y in self.wanted.desired.T]
 
     def advance(self, dt: float) -> None:
         """Go on by a time (s)."""
@@ -137,6 +134,12 @@ class _Job:
     def done(self) -> bool:
         """Whether the drive and its last readings are over."""
         return self._tail <= 0.0
+
+    def keep_desired(self, stamp: int, voltages: Sequence[float]) -> None:
+        """Record the desired displacements at the present time, if there are any, with the voltages (V) sent then."""
+        if self.wanted.desired.size:
+            desired = [float(np.interp(self._at, self.wanted.t, y)) for y in self.wanted.desired.T]
+            self.write(stamp, self._encoder.encode(stamp, desired, voltages), PATH)
 
     def write(self, stamp: int, message: bytes, topic: str) -> None:
         """Record a message; RecordError if that fails."""
@@ -282,7 +285,7 @@ class Calibrator(Node):
             self._outcome = worker.outcome()
 
     def _begin_job(self, wanted: Wanted) -> None:
-        self._job, self._stepped = _Job(wanted, self._output), time.monotonic()
+        self._job, self._stepped = _Job(wanted, self._output, self._settings.axes), time.monotonic()
         self._guard.begin()
 
     # Drives
@@ -301,19 +304,12 @@ class Calibrator(Node):
         self._guard.move(job.goals())
         if self._paused:
             return
-        if job.wanted.desired.size:
-            # Desired displacement and command, stamped as they are sent.
-            stamp = self.get_clock().now().nanoseconds
-            values = np.array([job.desired()]), np.array([self._guard.voltages])
-            self._write(job, stamp, encode_joint_states(np.array([stamp]), *values, self._settings.axes)[0], PATH)
-        if job.done:
-            self._end_job()
-
-    def _write(self, job: _Job, stamp: int, message: bytes, topic: str) -> None:
         try:
-            job.write(stamp, message, topic)
+            job.keep_desired(self.get_clock().now().nanoseconds, self._guard.voltages)
         except RecordError as error:
             self._fail(error)
+        if job.done:
+            self._end_job()
 
     def _end_job(self) -> None:
         """Complete the bag of the job, and tell the calibration."""
@@ -380,7 +376,10 @@ class Calibrator(Node):
     def _on_state(self, data: bytes, clock_ns: int) -> None:
         """Record a state if a drive is on its way."""
         if self._job is not None and not self._returning:
-            self._write(self._job, clock_ns, data, f"/{STATE}")
+            try:
+                self._job.write(clock_ns, data, f"/{STATE}")
+            except RecordError as error:
+                self._fail(error)
 
     # Ends
 
@@ -412,11 +411,11 @@ class Calibrator(Node):
             return
         doing = "waiting for the stage" if self._waiting or self._worker is not None else "waiting for ~/start"
         state = "paused" if self._paused else "computing" if self._job is None else "driving"
-        values: Mapping[str, object] = {"state": state if progress else "waiting"}
+        values: Mapping[str, object] = {"state": "waiting"}
         if progress:
             doing = progress.doing
             values = {
-                **values,
+                "state": state,
                 "step": progress.step,
                 "seconds_left": f"{progress.seconds_left:.1f}",
                 "mean_error_um": "" if progress.error is None else f"{progress.error * 1e6:.5f}",

@@ -3,7 +3,7 @@
 import math
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 
@@ -190,7 +190,7 @@ class Driver(Node):
         self._loop = DeviceLoop(device, settings.loop, self._publish)
         self._failure: SlpiError | None = None
         self._told = self._loop.status
-        self._reported_at, self._cycles_before, self._late_before = time.monotonic(), 0, 0
+        self._reported_at, self._reported = time.monotonic(), replace(self._loop.counts)
         self._deferred = {
             name: DeferredService(self, f"~/{name}", partial(self._ask, name)) for name in ("arm", "stop")
         }
@@ -312,8 +312,8 @@ class Driver(Node):
     def _report(self, now: float) -> None:
         loop, status, found, reading = self._loop, self._loop.status, self._loop.found, self._loop.latest
         elapsed, self._reported_at = now - self._reported_at, now
-        cycles, late = loop.counts.cycles - self._cycles_before, loop.counts.late - self._late_before
-        self._cycles_before, self._late_before = loop.counts.cycles, loop.counts.late
+        before, self._reported = self._reported, replace(loop.counts)
+        cycles, late = self._reported.cycles - before.cycles, self._reported.late - before.late
         since = datetime.fromtimestamp(status.since, UTC).isoformat(timespec="seconds") if status.since else ""
         problems = []
         if status.state is State.LOST:

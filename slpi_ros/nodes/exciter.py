@@ -2,20 +2,19 @@
 
 import math
 import time
-from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from builtin_interfaces.msg import Duration as DurationMsg
+import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from std_srvs.srv import Trigger
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from trajectory_msgs.msg import JointTrajectory
 
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
 from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.excitation.drives import DRIVES, SLEW_USED, Drive, Playback, excite, slew_limits
-from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.io.messages import SECOND_NS, encode_trajectory
 from slpi_ros.model.limits import Limits, volts
 from slpi_ros.nodes.common import COMMANDS, request_stop
 from slpi_ros.nodes.guarded_drive import GuardedDrive
@@ -337,16 +336,8 @@ class Exciter(Node):
         return playback.seconds_left
 
 
-def trajectory_of(playback: Playback) -> JointTrajectory:
-    """Return the remaining samples as a trajectory that starts now: volts in ``effort``, no positions."""
-    rate = playback.drive.rate
-    points = [
-        JointTrajectoryPoint(effort=array("d", voltages), time_from_start=_duration(number / rate))
-        for number, voltages in enumerate(playback.samples_left.tolist(), 1)
-    ]
-    return JointTrajectory(joint_names=list(playback.drive.axes), points=points)
-
-
-def _duration(seconds: float) -> DurationMsg:
-    whole_seconds, nanoseconds = divmod(round(seconds * SECOND_NS), SECOND_NS)
-    return DurationMsg(sec=whole_seconds, nanosec=nanoseconds)
+def trajectory_of(playback: Playback) -> bytes:
+    """Return the remaining samples as a serialised trajectory that starts now: volts in ``effort``, no positions."""
+    voltages, drive = playback.samples_left, playback.drive
+    times_ns = np.round(np.arange(1, len(voltages) + 1) * (SECOND_NS / drive.rate)).astype(np.int64)
+    return encode_trajectory(0, drive.axes, times_ns, np.empty((len(voltages), 0)), voltages)

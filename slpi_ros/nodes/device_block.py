@@ -20,8 +20,8 @@ ASK_NS = SECOND_NS // 20
 BUSY = "a block is being played; wait for its end, or stop it with an empty trajectory"
 
 
-class Told(Enum):
-    """What `voltage_trajectory_state` tells of a block."""
+class BlockPhase(Enum):
+    """How far a block is, as `voltage_trajectory_state` says."""
 
     ACCEPTED = "accepted"
     REFUSED = "refused"
@@ -34,7 +34,7 @@ class Told(Enum):
 class BlockState:
     """One state of a block."""
 
-    told: Told
+    phase: BlockPhase
     stamp_ns: int  # of the block
     sample: int  # number of samples that were played
     reason: str = ""
@@ -127,9 +127,9 @@ class BlockPlayer:
         """Whether nothing of it is left to do."""
         return self.ended and self._life is None
 
-    def tell(self, state: Told, reason: str = "") -> None:
-        """Tell a state."""
-        self._states.append(BlockState(state, self.stamp_ns, self.sample, reason))
+    def tell(self, phase: BlockPhase, reason: str = "") -> None:
+        """Say how far it is."""
+        self._states.append(BlockState(phase, self.stamp_ns, self.sample, reason))
 
     def prepare(self, device: Device) -> str:
         """Choose how the block is played; return why it is streamed, "" if the device plays it."""
@@ -170,13 +170,13 @@ class BlockPlayer:
                 if self.sample < self.count:
                     self._tell_playing()
                 else:
-                    self.finish(Told.ENDED)
+                    self.finish(BlockPhase.ENDED)
         yield
         self.recording = yield from device.recorded()
 
     def _tell_playing(self) -> None:
         self.begun_ns, self._asked_ns = self.begun_ns or self._now_ns, self._now_ns
-        self.tell(Told.PLAYING)
+        self.tell(BlockPhase.PLAYING)
 
     def goal(self, now_ns: int) -> tuple[float, ...]:
         """Return the voltages (V) to stream now."""
@@ -194,7 +194,7 @@ class BlockPlayer:
         if self.begun_ns and not self.by_device and not self.ended:
             self._readings.append(reading)
 
-    def finish(self, state: Told, reason: str = "") -> None:
+    def finish(self, phase: BlockPhase, reason: str = "") -> None:
         """End it; what the device recorded is read by the next turns."""
         self.ended = True
         if not self.begun_ns:
@@ -205,7 +205,7 @@ class BlockPlayer:
                 np.array([getattr(each, name) for each in self._readings]) for name in ("positions", "voltages")
             )
             self.recording = Recording(times, positions, voltages)
-        self.tell(state, reason)
+        self.tell(phase, reason)
 
 
 class Blocks:
@@ -253,11 +253,11 @@ class Blocks:
             reason = held or (BUSY if self._block else "")
             reason = reason or refusal(request, self._axes, self._limits, self._writer.written, self._period)
             if reason:
-                self.states.append(BlockState(Told.REFUSED, request.stamp_ns, 0, reason))
+                self.states.append(BlockState(BlockPhase.REFUSED, request.stamp_ns, 0, reason))
                 continue
             self._block = block = BlockPlayer(request, self._axes, self._writer.written, self.states)
             self._writer.goal = None
-            block.tell(Told.ACCEPTED, block.prepare(self._device))
+            block.tell(BlockPhase.ACCEPTED, block.prepare(self._device))
         if self._block is not None:
             moving = self.moving
             self._block.turn(now_ns)
@@ -275,7 +275,7 @@ class Blocks:
             return
         block.note(reading)
         if not (block.by_device or block.ended) and block.sample >= block.count and self._writer.at(block.last):
-            block.finish(Told.ENDED)
+            block.finish(BlockPhase.ENDED)
         self._put_away(block)
 
     def stop(self, reason: str) -> str:
@@ -286,14 +286,14 @@ class Blocks:
         if block.playing_by_device:
             block.sample = self._device.halt()
             self._writer.start(self._device.read().voltages)
-        block.finish(Told.STOPPED, reason)
+        block.finish(BlockPhase.STOPPED, reason)
         self._put_away(block)
         return f"the block was stopped at sample {block.sample} of {block.count}"
 
     def drop(self, reason: str) -> None:
         """End the block, as the link is lost."""
         if self._block is not None and not self._block.ended:
-            self._block.finish(Told.STOPPED, reason)
+            self._block.finish(BlockPhase.STOPPED, reason)
         self._block = None
 
     def _put_away(self, block: BlockPlayer) -> None:

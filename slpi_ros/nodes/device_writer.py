@@ -9,7 +9,7 @@ from slpi_ros.drivers.base import Reading
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import Limits, StageLimiter
 
-# The commands are told to be held at a limit for this time.
+# Commands count as held at a limit for this time.
 HELD_NS = SECOND_NS
 # A voltage of the device's range may be off by rounding, volts.
 ROUNDING = 1e-6

@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from functools import partial
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from rclpy.serialization import deserialize_message
@@ -26,7 +26,6 @@ from slpi_ros.nodes.common import (
     COMMANDS,
     ERROR,
     LATCHED,
-    OK,
     WARN,
     DeferredService,
     Diagnostics,
@@ -34,7 +33,7 @@ from slpi_ros.nodes.common import (
     ask_for_priority,
     request_stop,
 )
-from slpi_ros.nodes.device_block import BlockPlayer, BlockRequest, BlockState, Told
+from slpi_ros.nodes.device_block import BlockPhase, BlockPlayer, BlockRequest, BlockState
 from slpi_ros.nodes.device_link import State
 from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
@@ -43,7 +42,7 @@ VOLTAGE = (-10_000.0, 10_000.0)
 HOLD, REST = "hold", "rest"
 # Period of diagnostics, and of looks at what the thread of the device has done, seconds.
 REPORT_PERIOD, LOOK_PERIOD, LOG_PERIOD = 0.5, 0.05, 5.0
-# Share of the cycles that may be left out before it is told.
+# Share of the cycles that may be left out without a warning.
 LATE_SHARE = 0.02
 # Characters of a device's own identity in messages.
 LONGEST_IDENTITY = 100
@@ -189,7 +188,7 @@ class Driver(Node):
         self._diagnostics = Diagnostics(self, "driver")
         self._loop = DeviceLoop(device, settings.loop, self._publish)
         self._failure: SlpiError | None = None
-        self._told = self._loop.status
+        self._status = self._loop.status
         self._reported_at, self._reported = time.monotonic(), replace(self._loop.counts)
         self._deferred = {
             name: DeferredService(self, f"~/{name}", partial(self._ask, name)) for name in ("arm", "stop")
@@ -247,18 +246,12 @@ class Driver(Node):
     def _tell_block(self, state: BlockState) -> None:
         seconds, rest = divmod(state.stamp_ns, SECOND_NS)
         values = {"stamp": f"{seconds}.{rest:09d}", "sample": str(state.sample), "reason": state.reason}
-        self._block_publisher.publish(
-            DiagnosticStatus(
-                level=WARN if state.told in (Told.REFUSED, Told.STOPPED) else OK,
-                name=f"{self.get_fully_qualified_name()}: block",
-                message=state.told.value,
-                hardware_id=self._frame,
-                values=[KeyValue(key=key, value=shown(value)) for key, value in values.items()],
-            )
-        )
-        if state.told is not Told.PLAYING:
+        problem = ((WARN, state.phase.value),) if state.phase in (BlockPhase.REFUSED, BlockPhase.STOPPED) else ()
+        health = Health(problem, state.phase.value, values, self._frame)
+        self._block_publisher.publish(health.status(f"{self.get_fully_qualified_name()}: block"))
+        if state.phase is not BlockPhase.PLAYING:
             reason = f": {state.reason}" if state.reason else ""
-            self.get_logger().info(f"block {state.told.value} at sample {state.sample}{reason}")
+            self.get_logger().info(f"block {state.phase.value} at sample {state.sample}{reason}")
 
     def _publish_recording(self, block: BlockPlayer) -> None:
         recording = block.recording
@@ -287,10 +280,10 @@ class Driver(Node):
         while self._loop.blocks.recorded:
             self._publish_recording(self._loop.blocks.recorded.popleft())
         status, now = self._loop.status, time.monotonic()
-        changed = status.state is not self._told.state
+        changed = status.state is not self._status.state
         if changed:
             self._tell()
-        self._told = status
+        self._status = status
         if changed or now - self._reported_at >= REPORT_PERIOD:
             self._report(now)
 

@@ -250,7 +250,7 @@ class Exciter(Node):
         self.get_logger().info(f"exciting {', '.join(drive.axes)} for {self._values['duration']:g} s. {drive.why}")
 
     def _watch(self) -> None:
-        """Return to rest if the stage does not do what it is told, or another publisher of voltages has appeared."""
+        """Return to rest if the stage does not follow, or another publisher of voltages has appeared."""
         self._guard.listen()
         fault = self._guard.fault()
         if fault is not None and self._playback and not (self._returning or self._playback.stopping):

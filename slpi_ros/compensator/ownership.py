@@ -62,9 +62,9 @@ class Ownership:
         if start == SAVED:
             return axis.voltage, ""
         found = axis.amplifier.found(now_ns, self._since_ns)
-        if found is not None and not self._possible(axis, found):
-            return None, self._impossible(found)
         if found is not None:
+            if reason := self._impossible(axis, found):
+                return None, reason
             # The last output is known better than a noisy report of it.
             same = self._ever and abs(found - axis.voltage) <= axis.amplifier.scatter
             return (axis.voltage if same else found), ""
@@ -112,8 +112,8 @@ class Ownership:
             voltage = axis.amplifier.steady(now_ns, steady_ns)
             if voltage is None:
                 return f"axis '{axis.name}': stage_state reports no steady voltage (effort); stop what moves the stage"
-            if not self._possible(axis, voltage):
-                return f"axis '{axis.name}': {self._impossible(voltage)}"
+            if reason := self._impossible(axis, voltage):
+                return f"axis '{axis.name}': {reason}"
             found.append(voltage)
         for axis, voltage in zip(self._axes, found, strict=True):
             # The last output of an axis that nobody moved is known better than a noisy report of it.
@@ -124,14 +124,11 @@ class Ownership:
         return ""
 
     @staticmethod
-    def _possible(axis: Axis, voltage: float) -> bool:
-        """Return whether an amplifier of these limits can be at a voltage (V): at most `BEYOND` ranges outside."""
-        lower, upper = axis.limits.lower, axis.limits.upper
-        margin = BEYOND * (upper - lower)
-        return lower - margin <= voltage <= upper + margin
-
-    @staticmethod
-    def _impossible(voltage: float) -> str:
+    def _impossible(axis: Axis, voltage: float) -> str:
+        """Return why no amplifier of these limits can be at a voltage (V): `BEYOND` ranges outside; "" if it can."""
+        margin = BEYOND * axis.limits.span
+        if axis.limits.lower - margin <= voltage <= axis.limits.upper + margin:
+            return ""
         return (
             f"stage_state reports {voltage:.6g} V (effort), more than {BEYOND:g} voltage ranges beyond the limits; "
             "correct its unit, or the limits"

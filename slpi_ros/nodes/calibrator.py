@@ -7,10 +7,8 @@ from pathlib import Path
 
 import numpy as np
 from rclpy.clock import Clock, ClockType
-from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.calibration.drive_monitor import FARTHEST
@@ -25,8 +23,8 @@ from slpi_ros.io.desired import read_path
 from slpi_ros.io.messages import JointStateEncoder
 from slpi_ros.model.limits import Limits
 from slpi_ros.nodes.calibration_job import PATH, STATE, CalibrationJob, CalibrationOutcome, Wanted
-from slpi_ros.nodes.common import LATCHED, WARN, Diagnostics, Health, request_stop
-from slpi_ros.nodes.guarded_drive import GuardedDrive
+from slpi_ros.nodes.common import LATCHED, WARN, Diagnostics, Health, request_stop, serve
+from slpi_ros.nodes.guarded_drive import DELIVERY, GuardedDrive
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
 from slpi_ros.reports.calibration import PAGE
 
@@ -98,9 +96,8 @@ DECLARATIONS = (
 # Longest step of a drive (in periods of the rate) that follows a late sample.
 MOST_PERIODS = 2.0
 # Time for the last readings of a drive, or of a return to rest, to arrive; period of the held voltage between drives,
-# of the diagnostics and of messages while it waits; time for the delivery of the last message; longest wait for a state
-# at rest; seconds.
-TAIL, HOLD_PERIOD, REPORT_PERIOD, LOG_PERIOD, DELIVERY, LATEST = 0.3, 0.1, 1.0, 5.0, Duration(seconds=1.0), 2.0
+# of the diagnostics and of messages while it waits; longest wait for a state at rest; seconds.
+TAIL, HOLD_PERIOD, REPORT_PERIOD, LOG_PERIOD, LATEST = 0.3, 0.1, 1.0, 5.0, 2.0
 # A path may lose this share of its range when it is sampled.
 MOST_LOST = 0.05
 RESUME = "what was recorded is kept, go on with resume:=true"
@@ -245,7 +242,7 @@ class Calibrator(Node):
         self._models = self.create_publisher(String, "stage_model", LATCHED)
         self._diagnostics = Diagnostics(self, "calibrator")
         for name, answer in (("start", self._on_start), ("pause", self._on_pause), ("stop", self._on_stop)):
-            self.create_service(Trigger, f"~/{name}", answer)
+            serve(self, f"~/{name}", answer)
         self._waiting = bool(values["autostart"])
         period = 1.0 / settings.rate
         # A simulated clock drives a simulated stage; the watch goes on if it stops.
@@ -424,25 +421,21 @@ class Calibrator(Node):
 
     # Services
 
-    def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._failure is None and self._outcome is None
+    def _on_start(self) -> tuple[bool, str]:
         begun, paused, self._paused = self._waiting or self._worker is not None, self._paused, False
-        if begun and paused:
-            response.message = "goes on"
-        elif begun:
-            response.success, response.message = False, "already started"
-        else:
-            self._waiting, self._begun, response.message = True, time.monotonic(), "started"
-        return response
+        if begun and not paused:
+            return False, "already started"
+        if not begun:
+            self._waiting, self._begun = True, time.monotonic()
+        return self._failure is None and self._outcome is None, "goes on" if begun else "started"
 
-    def _on_pause(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._paused, response.success, response.message = True, True, "the voltages are held until ~/start"
-        return response
+    def _on_pause(self) -> tuple[bool, str]:
+        self._paused = True
+        return True, "the voltages are held until ~/start"
 
-    def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_stop(self) -> tuple[bool, str]:
         self._fail(Interrupted("calibrator: stopped by ~/stop"))
-        response.success, response.message = True, "returning to rest"
-        return response
+        return True, "returning to rest"
 
 
 def _prepare(output: Path, *, resume: bool) -> None:

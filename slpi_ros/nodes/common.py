@@ -80,6 +80,16 @@ class DeferredService:
             self._waiting.append(header)
 
 
+def serve(node: Node, name: str, act: Callable[[], tuple[bool, str]]) -> None:
+    """Offer a Trigger service that answers what `act` returns: whether it succeeded, and a text."""
+
+    def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = act()
+        return response
+
+    node.create_service(Trigger, name, answer)
+
+
 def refuse_impossible_transitions(node: LifecycleNode) -> None:
     """Refuse requests for a lifecycle transition that the present state does not allow."""
     # Otherwise rclpy ends the process, for instance after two calls of ``ros2 lifecycle set NODE configure``.

@@ -100,22 +100,13 @@ class BlockPlayer:
         self.voltages = np.tile(np.array(present), (self._times_ns.size, 1))
         for column, name in enumerate(request.names):
             self.voltages[:, axes.index(name)] = request.voltages[:, column]
+        self.count, self.last = len(self.voltages), tuple(self.voltages[-1].tolist())
         self.by_device = self.ended = False
         self.sample = self.begun_ns = 0  # 0: not yet
         self.recording: Recording | None = None
         self._readings: list[Reading] = []
         self._life: Generator[None] | None = None  # what the device still has to do
         self._asked_ns = self._now_ns = 0
-
-    @property
-    def count(self) -> int:
-        """Number of samples."""
-        return len(self.voltages)
-
-    @property
-    def last(self) -> tuple[float, ...]:
-        """Voltages (V) at its end."""
-        return tuple(self.voltages[-1].tolist())
 
     @property
     def playing_by_device(self) -> bool:

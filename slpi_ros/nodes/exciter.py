@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
@@ -16,7 +15,7 @@ from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.excitation.drives import DRIVES, SLEW_USED, Drive, Playback, excite, slew_limits
 from slpi_ros.io.messages import SECOND_NS, encode_trajectory
 from slpi_ros.model.limits import Limits, volts
-from slpi_ros.nodes.common import COMMANDS, request_stop
+from slpi_ros.nodes.common import COMMANDS, request_stop, serve
 from slpi_ros.nodes.guarded_drive import GuardedDrive
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
 
@@ -150,8 +149,8 @@ class Exciter(Node):
             self, values["axes"], self._parameter_set.settings.limits, values["rate"], values["state_timeout"],
             publisher=publisher,
         )  # fmt: skip
-        self.create_service(Trigger, "~/start", self._on_start)
-        self.create_service(Trigger, "~/stop", self._on_stop)
+        serve(self, "~/start", self._on_start)
+        serve(self, "~/stop", self._on_stop)
         # A simulated clock may stop, and the system clock may be set back.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._listeners, self._same_since = 0, 0.0  # number of subscribers, and since when it is the same
@@ -184,14 +183,11 @@ class Exciter(Node):
 
     # Before the excitation
 
-    def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_start(self) -> tuple[bool, str]:
         if self._playback or not self._waiting.is_canceled():
-            response.message = "already started; call ~/stop first"
-        else:
-            self._wait()
-            response.success = True
-            response.message = f"drive '{self._values['drive']}' of {self._values['duration']:g} s"
-        return response
+            return False, "already started; call ~/stop first"
+        self._wait()
+        return True, f"drive '{self._values['drive']}' of {self._values['duration']:g} s"
 
     def _wait(self) -> None:
         self._guard.prepare(self._parameter_set.settings.limits, self._values["rate"])
@@ -320,11 +316,9 @@ class Exciter(Node):
 
     # Stop
 
-    def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = True
+    def _on_stop(self) -> tuple[bool, str]:
         self._waiting.cancel()
-        response.message = f"back in {self._return(self._playback):.1f} s" if self._playback else "at rest"
-        return response
+        return True, f"back in {self._return(self._playback):.1f} s" if self._playback else "at rest"
 
     def _return(self, playback: Playback) -> float:
         """Start the return to rest; return its duration, seconds."""

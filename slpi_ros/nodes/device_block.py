@@ -10,8 +10,8 @@ import numpy as np
 from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.drivers.base import Block, Device, Reading, Recording
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.model.limits import Limits, volts
-from slpi_ros.nodes.device_writer import Writer
+from slpi_ros.model.limits import volts
+from slpi_ros.nodes.device_writer import LoopSettings, Writer
 
 # Steps of a block may exceed the slew limit by rounding, and its samples miss the device's clock by this share.
 ROUNDING, OFF_CLOCK = 1e-6, 1e-3
@@ -50,11 +50,9 @@ class BlockRequest:
     voltages: FloatArray  # V, (N, names)
 
 
-def refusal(
-    request: BlockRequest, axes: Sequence[str], limits: Sequence[Limits], present: Sequence[float], period: float
-) -> str:
-    """Return why a block may not be played from the `present` voltages (V), "" if it may; `period` (s) of a cycle."""
-    times, values = request.times_ns, request.voltages
+def refusal(request: BlockRequest, settings: LoopSettings, present: Sequence[float]) -> str:
+    """Return why a block may not be played from the `present` voltages (V), "" if it may."""
+    axes, times, values = settings.axes, request.times_ns, request.voltages
     if not request.names or len(set(request.names)) != len(request.names):
         return f"it names the axes {', '.join(request.names) or 'not'}; name each once"
     if unknown := [name for name in request.names if name not in axes]:
@@ -65,16 +63,17 @@ def refusal(
         return "its times do not increase; give each sample its own time"
     if not np.isfinite(values).all():
         return "a voltage is not finite"
-    for column, name in enumerate(request.names):
-        own, place = limits[axes.index(name)], axes.index(name)
-        v = values[:, column]
-        if v.min() < own.lower - ROUNDING or v.max() > own.upper + ROUNDING:
-            at = int(np.argmax((v < own.lower - ROUNDING) | (v > own.upper + ROUNDING)))
+    # The first sample may be as far as one cycle of single voltages.
+    seconds = np.diff(times, prepend=min(0, times[0] - round(2.0 * SECOND_NS / settings.rate))) / SECOND_NS
+    for name, v in zip(request.names, values.T, strict=True):
+        place = axes.index(name)
+        own = settings.limits[place]
+        beyond = (v < own.lower - ROUNDING) | (v > own.upper + ROUNDING)
+        if beyond.any():
+            at = int(np.argmax(beyond))
             return f"axis '{name}', sample {at}: {volts(v[at])} V is beyond {own.lower:g} to {own.upper:g} V"
         steps = np.abs(np.diff(v, prepend=present[place]))
-        # The first sample may be as far as one cycle of single voltages.
-        allowed = own.slew * np.diff(times, prepend=min(0, times[0] - round(2.0 * period * SECOND_NS))) / SECOND_NS
-        fast = steps > allowed * (1.0 + OFF_CLOCK) + ROUNDING
+        fast = steps > own.slew * seconds * (1.0 + OFF_CLOCK) + ROUNDING
         if fast.any():
             at = int(np.argmax(fast))
             if at == 0:
@@ -82,8 +81,9 @@ def refusal(
                     f"axis '{name}': it begins at {volts(v[0])} V, but the device is at {volts(present[place])} V; "
                     "begin at the present voltage"
                 )
-            rate = steps[at] / (times[at] - times[at - 1]) * SECOND_NS
-            return f"axis '{name}', sample {at}: {rate:.4g} V/s, more than slew_limit {own.slew:g} V/s"
+            return (
+                f"axis '{name}', sample {at}: {steps[at] / seconds[at]:.4g} V/s, more than slew_limit {own.slew:g} V/s"
+            )
     return ""
 
 
@@ -205,13 +205,10 @@ class Blocks:
     `submit` and `busy` are for any thread, the others for that of the device. Where a block ends, `writer` goes on.
     """
 
-    def __init__(
-        self, device: Device, axes: Sequence[str], limits: Sequence[Limits], period: float, writer: Writer
-    ) -> None:
+    def __init__(self, device: Device, settings: LoopSettings, writer: Writer) -> None:
         self.states: deque[BlockState] = deque()
         self.recorded: deque[BlockPlayer] = deque()  # that ended with a recording
-        self._device, self._axes, self._limits, self._period = device, axes, limits, period
-        self._writer = writer
+        self._device, self._settings, self._writer = device, settings, writer
         self._submitted: deque[BlockRequest] = deque()
         self._block: BlockPlayer | None = None
 
@@ -242,11 +239,11 @@ class Blocks:
                 self.stop("by an empty trajectory")
                 continue
             reason = held or (BUSY if self._block else "")
-            reason = reason or refusal(request, self._axes, self._limits, self._writer.written, self._period)
+            reason = reason or refusal(request, self._settings, self._writer.written)
             if reason:
                 self.states.append(BlockState(BlockPhase.REFUSED, request.stamp_ns, 0, reason))
                 continue
-            self._block = block = BlockPlayer(request, self._axes, self._writer.written, self.states)
+            self._block = block = BlockPlayer(request, self._settings.axes, self._writer.written, self.states)
             self._writer.goal = None
             block.tell(BlockPhase.ACCEPTED, block.prepare(self._device))
         if self._block is not None:

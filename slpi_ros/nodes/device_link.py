@@ -1,15 +1,14 @@
 """The link to a device: opened and checked, lost and tried again; whether it may be moved."""
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import Enum
 
 from slpi_ros.drivers.base import Device, Found, UnsuitableError
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.model.limits import Limits
-from slpi_ros.nodes.device_writer import ROUNDING
+from slpi_ros.nodes.device_writer import ROUNDING, LoopSettings
 
 # Time between two attempts to reach a device.
 RETRY_NS = SECOND_NS // 4
@@ -40,12 +39,9 @@ class Link:
     `take_over_servo` switched off where motion was agreed to.
     """
 
-    def __init__(
-        self, device: Device, axes: Sequence[str], limits: Sequence[Limits], take_over_servo: bool,
-        now_ns: Callable[[], int],
-    ) -> None:  # fmt: skip
+    def __init__(self, device: Device, settings: LoopSettings, now_ns: Callable[[], int]) -> None:
         self.status = Status(State.OPENING)
-        self._device, self._axes, self._limits, self._take_over_servo = device, axes, limits, take_over_servo
+        self._device, self._settings = device, settings
         self._now_ns, self._retry_ns = now_ns, 0
 
     @property
@@ -80,9 +76,9 @@ class Link:
         self._require_range(found)
         if not any(found.servo):
             return found, f"the link was lost ({self.status.reason}) and is back; call ~/arm to go on"
-        axes = [axis for axis, on in zip(self._axes, found.servo, strict=True) if on]
+        axes = [axis for axis, on in zip(self._settings.axes, found.servo, strict=True) if on]
         what = f"{self._device.name}: the servo of axis {', '.join(axes)} is on: the device moves the voltage itself"
-        if not self._take_over_servo:
+        if not self._settings.take_over_servo:
             raise UnsuitableError(f"{what}; switch it off, or set take_over_servo")
         # Releasing the servo may move the stage a little: only where somebody has agreed to motion.
         if arm and any((found := self._device.release_servo()).servo):
@@ -91,7 +87,8 @@ class Link:
 
     def _require_range(self, found: Found) -> None:
         """Raise UnsuitableError where the limits are beyond the device's own range."""
-        for axis, limits, low, high in zip(self._axes, self._limits, found.lowest, found.highest, strict=True):
+        every = zip(self._settings.axes, self._settings.limits, found.lowest, found.highest, strict=True)
+        for axis, limits, low, high in every:
             if limits.lower < low - ROUNDING or limits.upper > high + ROUNDING:
                 raise UnsuitableError(
                     f"{self._device.name}: axis '{axis}': voltage_min {limits.lower:g} and voltage_max "

@@ -11,26 +11,14 @@ from dataclasses import dataclass
 from slpi_ros.compensator.statistics import Timing
 from slpi_ros.drivers.base import Device, DeviceError, Found, Reading
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.model.limits import Limits, volts
+from slpi_ros.model.limits import volts
 from slpi_ros.nodes.device_block import BUSY, Blocks
 from slpi_ros.nodes.device_link import Link, State, Status
 from slpi_ros.nodes.device_pace import Pace
-from slpi_ros.nodes.device_writer import Writer
+from slpi_ros.nodes.device_writer import LoopSettings, Writer
 
 # Longest wait of the thread for a command, seconds.
 LONGEST_SLEEP = 0.05
-
-
-@dataclass(frozen=True)
-class LoopSettings:
-    """Settings of a `DeviceLoop`; voltages are those at the stage."""
-
-    axes: tuple[str, ...]
-    limits: tuple[Limits, ...]
-    rate: float = 1000.0  # Hz
-    take_over_servo: bool = False
-    rearm: bool = False
-    rest: tuple[float, ...] | None = None  # V, to ramp to at the end; None: hold
 
 
 @dataclass
@@ -73,10 +61,8 @@ class DeviceLoop:
         self.latest: Reading | None = None
         self.answers: deque[tuple[str, bool, str]] = deque()  # request, whether it succeeded, text
         self._device, self._settings, self._on_reading, self._now_ns = device, settings, on_reading, now_ns
-        axes, limits, period = settings.axes, settings.limits, 1.0 / settings.rate
-        self._link = Link(device, axes, limits, settings.take_over_servo, now_ns)
-        self._writer = Writer(axes, limits, period)
-        self.blocks = Blocks(device, axes, limits, period, self._writer)
+        self._link, self._writer = Link(device, settings, now_ns), Writer(settings)
+        self.blocks = Blocks(device, settings, self._writer)
         # Free once a command has come that no cycle has taken; an event would take several times longer.
         self._commanded = threading.Lock()
         self._commanded.acquire()

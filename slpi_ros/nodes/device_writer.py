@@ -1,6 +1,7 @@
 """The voltages of a device: the last limits before the wire, and whether the device says that it follows."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from math import inf
 
 from slpi_ros.compensator.amplifier import Amplifier, VoltageLimits
@@ -25,16 +26,29 @@ REPORTED = VoltageLimits(
 )
 
 
+@dataclass(frozen=True)
+class LoopSettings:
+    """What the loop of a driver keeps to; voltages are those at the stage."""
+
+    axes: tuple[str, ...]
+    limits: tuple[Limits, ...]
+    rate: float = 1000.0  # Hz
+    take_over_servo: bool = False
+    rearm: bool = False
+    rest: tuple[float, ...] | None = None  # V, to ramp to at the end; None: hold
+
+
 class Writer:
     """Moves the voltages of a device from where they are to a goal, within the limits; what it says goes to `monitor`.
 
     `goal` is of the last command, V, None: none.
     """
 
-    def __init__(self, axes: Sequence[str], limits: Sequence[Limits], period: float) -> None:
+    def __init__(self, settings: LoopSettings) -> None:
+        axes, limits = settings.axes, settings.limits
         self.goal: tuple[float, ...] | None = None
         self._axes, self._limits = axes, limits
-        self._limiter = StageLimiter(limits, period)
+        self._limiter = StageLimiter(limits, 1.0 / settings.rate)
         self._limited_ns = [-(1 << 62)] * len(limits)
         self._reports = [Amplifier(each.span, REPORTED, axis) for axis, each in zip(axes, limits, strict=True)]
         self.monitor = Monitor(*self._reports)

@@ -35,7 +35,8 @@ from slpi_ros.nodes.common import (
 )
 from slpi_ros.nodes.device_block import BlockPhase, BlockPlayer, BlockRequest, BlockState
 from slpi_ros.nodes.device_link import State
-from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings
+from slpi_ros.nodes.device_loop import DeviceLoop
+from slpi_ros.nodes.device_writer import LoopSettings
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, numbers, validated
 
 VOLTAGE = (-10_000.0, 10_000.0)

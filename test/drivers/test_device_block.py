@@ -13,7 +13,8 @@ from slpi_ros.drivers import gcs_waves, labjack, nidaqmx, stream
 from slpi_ros.model.limits import Limits
 from slpi_ros.nodes.device_block import BlockPhase, BlockRequest
 from slpi_ros.nodes.device_link import State
-from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings
+from slpi_ros.nodes.device_loop import DeviceLoop
+from slpi_ros.nodes.device_writer import LoopSettings
 from slpi_ros.simulation.devices.base import LOST, SILENT, Fault
 
 RATE, SLEW = 500.0, 2000.0

@@ -4,14 +4,14 @@ import pytest
 
 from slpi_ros.drivers.base import Reading
 from slpi_ros.model.limits import Limits
-from slpi_ros.nodes.device_writer import ROUNDING, Writer
+from slpi_ros.nodes.device_writer import ROUNDING, LoopSettings, Writer
 
 MS = 1_000_000
 
 
 def writer_at(*voltages, offsets=(), slew=500.0):
     axes = ("x", "y")[: len(voltages)]
-    made = Writer(axes, [Limits(0.0, 100.0, slew)] * len(voltages), 1e-3)
+    made = Writer(LoopSettings(axes, (Limits(0.0, 100.0, slew),) * len(voltages)))
     made.start(voltages, offsets)
     return made
 

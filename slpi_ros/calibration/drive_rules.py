@@ -12,8 +12,8 @@ from slpi_ros.compensator.sensor_rule import BEND, FEWEST, KEPT, FollowingLimits
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import Limits
 
-# This many states over this time (ns), or for this time nothing else, show a fault.
-STATES, LASTS_NS = 3, SECOND_NS // 10
+# This many states over this time (ns) show a fault; more of them with one stamp for longer than the last time.
+STATES, LASTS_NS, STANDS_NS = 3, SECOND_NS // 10, 3 * SECOND_NS // 10
 # A drive may be silent for this many of the longest interval of states before it; longer intervals (s) are silence.
 INTERVALS, LONGEST_INTERVAL = 2.5, 5.0
 # Cells of the voltage range in which displacements are known.
@@ -70,7 +70,7 @@ class StampRule(Rule):
         if not stamp_ns:
             return
         offset = (stamp_ns - clock_ns) * 1e-9
-        stands = self._same.note(str(stamp_ns), now_ns, 3 * LASTS_NS)
+        stands = self._same.note(str(stamp_ns), now_ns, STANDS_NS + 1)
         if not driving:
             self._offsets.append(offset)
             self._offset = float(np.median(self._offsets))

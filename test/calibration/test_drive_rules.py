@@ -34,7 +34,7 @@ def test_stamps_that_jump_are_found_after_a_tenth_of_a_second_and_three_states()
 
 def test_stamps_that_stand_still_are_found_after_three_tenths_of_a_second():
     number, reason = stamped([-k / 200 for k in range(100)])
-    assert number == 60 and "stand still over 61 states" in reason
+    assert number == 61 and "stand still over 62 states" in reason
 
 
 def test_valid_states_may_come_as_slowly_as_before_the_drive():

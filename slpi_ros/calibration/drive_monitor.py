@@ -41,11 +41,6 @@ class DriveMonitor:
         self._now_ns, self._last_ns = 0, -1
 
     @property
-    def known(self) -> bool:
-        """Whether the slope of every axis is known."""
-        return all(relation.known for relation in self._relations)
-
-    @property
     def refused(self) -> str:
         """Why the last state was not valid; "" if it was, or none has come."""
         return self._states.refused

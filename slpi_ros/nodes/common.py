@@ -15,6 +15,7 @@ from typing import Any, Protocol, runtime_checkable
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray, DiagnosticStatus, KeyValue
 from lifecycle_msgs.srv import ChangeState
+from numpy.typing import ArrayLike
 from rclpy.exceptions import NameValidationException, ParameterException
 from rclpy.executors import Executor, ExternalShutdownException, SingleThreadedExecutor
 from rclpy.impl.implementation_singleton import rclpy_implementation
@@ -26,9 +27,10 @@ from rclpy.signals import SignalHandlerOptions
 from rclpy.utilities import ok, try_shutdown
 from sensor_msgs.msg import JointState
 from std_srvs.srv import Trigger
+from trajectory_msgs.msg import JointTrajectory
 
 from slpi_ros.errors import RecordError, SlpiError, UsageError, shown
-from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.io.messages import SECOND_NS, decode_trajectory
 from slpi_ros.nodes import stop
 from slpi_ros.nodes.stop import SIGNALS, Stop
 
@@ -50,6 +52,21 @@ def as_rclpy_reads(data: bytes) -> tuple[int, Sequence[str], Sequence[float]]:
         return 0, (), ()
     stamp = message.header.stamp
     return stamp.sec * SECOND_NS + stamp.nanosec, message.name, message.position
+
+
+def read_trajectory(data: bytes, field: str = "positions") -> tuple[int, Sequence[str], ArrayLike, ArrayLike]:
+    """Return stamp (ns), names, times (ns) and a field (positions, effort) of a serialized JointTrajectory."""
+    # An unreadable message gives no names; points of different lengths are returned as such. Both are then rejected.
+    if arrays := decode_trajectory(data, field):
+        return arrays.start_ns, arrays.names, arrays.time_from_start_ns, arrays.values
+    try:
+        message = deserialize_message(data, JointTrajectory)
+    except RuntimeError:
+        return 0, (), [0], [[]]
+    stamp, points = message.header.stamp, message.points
+    times = [point.time_from_start.sec * SECOND_NS + point.time_from_start.nanosec for point in points]
+    values = [getattr(point, field).tolist() for point in points]
+    return stamp.sec * SECOND_NS + stamp.nanosec, message.joint_names, times, values
 
 
 class DeferredService:

@@ -11,7 +11,6 @@ import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
@@ -20,7 +19,7 @@ from slpi_ros.drivers.base import Channel, Reading
 from slpi_ros.drivers.registry import MODULES, make_device
 from slpi_ros.errors import SlpiError, UsageError, shown
 from slpi_ros.excitation.drives import slew_limits
-from slpi_ros.io.messages import SECOND_NS, JointStateEncoder, decode_trajectory, encode_trajectory
+from slpi_ros.io.messages import SECOND_NS, JointStateEncoder, encode_trajectory
 from slpi_ros.model.limits import Limits, volts
 from slpi_ros.nodes.common import (
     COMMANDS,
@@ -31,6 +30,7 @@ from slpi_ros.nodes.common import (
     Diagnostics,
     Health,
     ask_for_priority,
+    read_trajectory,
     request_stop,
 )
 from slpi_ros.nodes.device_block import BlockPhase, BlockPlayer, BlockRequest, BlockState
@@ -349,18 +349,8 @@ class Driver(Node):
 
 def _read_block(data: bytes) -> BlockRequest:
     """Return a serialised JointTrajectory; one that cannot be read names no axis, so that it is refused."""
-    if arrays := decode_trajectory(data, "effort"):
-        return BlockRequest(arrays.start_ns, arrays.names, arrays.time_from_start_ns, arrays.values)
-    try:
-        message = deserialize_message(data, JointTrajectory)
-    except RuntimeError:
-        return BlockRequest(0, (), np.zeros(1, np.int64), np.zeros((1, 0)))
-    stamp, points = message.header.stamp, message.points
-    times = [each.time_from_start.sec * SECOND_NS + each.time_from_start.nanosec for each in points]
-    lengths = {len(each.effort) for each in points}
-    # Points with different numbers of voltages are refused by their shape.
-    width = lengths.pop() if len(lengths) == 1 else 0
-    values = np.array([list(each.effort)[:width] for each in points], float).reshape(len(points), width)
-    return BlockRequest(
-        stamp.sec * SECOND_NS + stamp.nanosec, tuple(message.joint_names), np.array(times, np.int64), values
-    )
+    stamp_ns, names, times_ns, values = read_trajectory(data, "effort")
+    if isinstance(values, list) and len({*map(len, values)}) > 1:
+        # Points with different numbers of voltages are refused by their shape.
+        values = [[]] * len(values)
+    return BlockRequest(stamp_ns, tuple(names), np.array(times_ns, np.int64), np.array(values, float, ndmin=2))

@@ -457,8 +457,7 @@ class Episode:
                 self.made.measure(["x"], [told], self.now_ns, self.rng.random() < 0.8)
             self.send(AXES, [self.rng.uniform(0.3, 0.6)] * 2)
             self.wait(0.004)
-            for axis in self.made.axes if self.made.ownership.owned else ():
-                axis.loop.faulty(0.05, self.now_ns)
+            self.made.watch(Safety(0.0, False, False, (0.0, 0.0), 50.0), 0.05, self.now_ns)
 
     def intruder(self) -> None:
         """Somebody else moves the amplifier, and reports tell; then `arm`."""

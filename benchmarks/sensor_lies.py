@@ -12,7 +12,8 @@ from math import inf, nan
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.calibration.drive_watch import LASTS, LATE, DriveWatch
+from slpi_ros.calibration.drive_monitor import LATE, DriveMonitor
+from slpi_ros.calibration.drive_rules import LASTS_NS
 from slpi_ros.calibration.drives import checking, exciting
 from slpi_ros.calibration.settings import CalibrationSettings
 from slpi_ros.excitation.drives import DRIVES, SLEW_USED, Drive, excite
@@ -120,7 +121,7 @@ def live(
     """Return what the watch finds in a run in which a sensor begins to lie at a share of the last drive; "" : none."""
     rng = np.random.default_rng([seed, 40])
     axes, limits = list(stage.axes), Limits(LOW, HIGH, slew)
-    watch = DriveWatch(axes, [limits] * len(axes), TIMEOUT)
+    watch = DriveMonitor(axes, [limits] * len(axes), TIMEOUT)
     now, start = 10.0, [LOW] * len(axes)
     runs = []
     for each in drives_of(driver, axes, seed, slew, drive, seconds):
@@ -142,14 +143,14 @@ def live(
     return life
 
 
-def _tell(watch: DriveWatch, now: float, stamp: float, v: Sequence[float], y: Sequence[float]) -> None:
+def _tell(watch: DriveMonitor, now: float, stamp: float, v: Sequence[float], y: Sequence[float]) -> None:
     watch.state(
         CLOCK_NS + round(stamp * SECOND_NS), CLOCK_NS + round(now * SECOND_NS), list(v), list(y), round(now * SECOND_NS)
     )
 
 
 def _watched(
-    watch: DriveWatch, run: _Truth, lie: str, sensor: Sensor, stroke: float, rng: np.random.Generator, at: float
+    watch: DriveMonitor, run: _Truth, lie: str, sensor: Sensor, stroke: float, rng: np.random.Generator, at: float
 ) -> Life:
     begun, count = run.t[0], run.t.size
     lies_from = begun + at * (run.t[-1] - begun) if lie else inf
@@ -183,7 +184,7 @@ def _watched(
                     contradicted = now
                 if shown != shown and (off > SHOWS or abs(said_stamp - stamp) > SHOWS_SECONDS):
                     shown = now
-                if shown != shown and now - contradicted >= LASTS:
+                if shown != shown and now - contradicted >= LASTS_NS / SECOND_NS:
                     shown = contradicted
                 _tell(watch, now, said_stamp, said_v.tolist(), said_y.tolist())
             next_state += spacing

@@ -92,7 +92,7 @@ def _path_of(options: Namespace) -> tuple[dict[str, "FloatArray"], float]:
     """Return the voltages (V) of the path by axis, (N,), and their sampling rate (Hz)."""
     import numpy as np
 
-    from slpi_ros.calibration.drive_watch import FARTHEST
+    from slpi_ros.calibration.drive_monitor import FARTHEST
     from slpi_ros.io.desired import read_path
     from slpi_ros.model.document import load_model
     from slpi_ros.model.stage_model import check_time

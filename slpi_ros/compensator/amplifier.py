@@ -7,6 +7,8 @@ from statistics import median
 
 import numpy as np
 
+from slpi_ros.arrays import FloatArray
+from slpi_ros.compensator.monitor import Finding, Lasting, Rule
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import volts
 
@@ -17,14 +19,12 @@ REPORTS, MOST_REPORTS, REPORT_AGE_NS, SLOW_NS = 3, 5, SECOND_NS // 5, SECOND_NS
 MUTE_NS = 3 * SECOND_NS
 # Reports are compared with the voltages of this time, and of the settling time of the stage's effects.
 BAND_NS = SECOND_NS // 5
-# They may be off by this share of the voltage range, or by this many times their noise.
-TOLERATED_SHARE, TOLERATED_NOISES = 0.02, 4.0
+# They may be off by this share of the voltage range.
+TOLERATED_SHARE = 0.02
 # This many reports over this time outside: the voltage is another one.
 FOREIGN_REPORTS, FOREIGN_NS = 3, SECOND_NS // 10
 # Reports are steady if they stay within the tolerance for this time; a rearming node waits longer.
 STEADY_NS, REARM_NS = SECOND_NS // 5, SECOND_NS // 2
-# A voltage of this many ranges is none, in whatever unit.
-ABSURD = 1e4
 # Voltages are kept in pieces of this length.
 PIECE_NS = SECOND_NS // 100
 # A gain or an offset of the reports is one that explains this share of them, and of those while the voltage moved;
@@ -57,24 +57,66 @@ class Calibration:
         return (reported - self.offset) / self.gain
 
 
-class Amplifier:
-    """Reports of the voltage of one axis: where it starts, whether somebody else moves it. Times: steady clock, ns."""
+@dataclass(frozen=True)
+class VoltageLimits:
+    """When reports contradict the voltages that were output, and what is said then."""
 
-    def __init__(self, span: float) -> None:
-        self.span = span  # V, of the node
+    share: float = TOLERATED_SHARE  # further off than this share of the voltage range,
+    noises: float = 4.0  # and than this many times the noise of the reports,
+    reports: int = FOREIGN_REPORTS  # this many of them
+    lasts_ns: int = FOREIGN_NS  # over this time
+    window_ns: int = BAND_NS  # for this time an output voltage may still be reported
+    absurd: float = 1e4  # a report beyond this many ranges is none, in whatever unit
+    calibrated: bool = True  # a constant gain or offset that explains the reports is calibration, and no contradiction
+    reason: str = (  # of {reported} V, where {there}, the last time {last} V
+        "stage_state reports {reported} V (effort), but {there}: somebody else moves the stage, its driver limits the "
+        "voltage, or the report is wrong; find out which"
+    )
+    then: str = ", then call ~/arm"
+
+
+class _Pieces(deque[tuple[int, float, float]]):
+    """Lowest and highest of values (V) in pieces of time, by the number of the piece."""
+
+    def add(self, low: float, high: float, now_ns: int) -> None:
+        """Take values from `low` to `high` at `now_ns`."""
+        number = now_ns // PIECE_NS
+        if self and self[-1][0] == number:
+            _, lowest, highest = self.pop()
+            low, high = min(low, lowest), max(high, highest)
+        self.append((number, low, high))
+
+    def since(self, oldest_ns: int) -> list[tuple[int, float, float]]:
+        """Return the pieces from that of a time on."""
+        return [each for each in self if each[0] >= oldest_ns // PIECE_NS]
+
+
+class Amplifier(Rule):
+    """Reports of the voltage of one axis: where it starts, and the rule that nobody else moves it. Steady clock, ns.
+
+    The rule holds each report against the voltages that were output within `window_ns`, once `begin` has said where the
+    axis is; within its `limits` (as shares of `span`, V) and `slack` (V) they agree.
+    """
+
+    def __init__(self, span: float, limits: VoltageLimits | None = None, axis: str = "") -> None:
+        self.span, self.limits, self.axis = span, limits or VoltageLimits(), axis
+        self.slack = 0.0  # V, by which reports may be off besides
         self.calibration = Calibration()  # the relation of reports to voltages that was found
         self.foreign = ""  # how the reports contradict the voltages that were output; "" while they agree
-        self.window_ns = BAND_NS  # for this time an output voltage may still be reported
-        # Reports (ns, V); output voltages as pieces (number, lowest, highest); time, output and report (ns, V, V).
-        self._reports: deque[tuple[int, float]] = deque(maxlen=64)
-        self._pieces: deque[tuple[int, float, float]] = deque()
-        # Reports as pieces, for longer than the last ones of a fast driver last.
-        self._told: deque[tuple[int, float, float]] = deque(maxlen=2 * REARM_NS // PIECE_NS)
+        self.window_ns = self.limits.window_ns
+        self._reports: deque[tuple[int, float]] = deque(maxlen=64)  # ns, V
+        self._outputs = _Pieces()
+        # For longer than the last reports of a fast driver last.
+        self._levels = _Pieces(maxlen=2 * REARM_NS // PIECE_NS)
         self._last: float | None = None
-        self._pairs: deque[tuple[float, float, float]] = deque(maxlen=KEPT)
+        self._pairs: deque[tuple[float, float, float]] = deque(maxlen=KEPT)  # time (ns), output and report (V)
         self._differences: deque[float] = deque(maxlen=DIFFERENCES)
-        self._outside, self._outside_ns = 0, 0
+        self._outside = Lasting(self.limits.reports)
         self._begun_ns = self._output_ns = 0
+
+    def check(self, now_ns: int) -> Finding | None:
+        """Return how the reports contradict the voltages that were output; it stands until `begin`."""
+        return Finding("voltage", "foreign", self.foreign, self.axis) if self.foreign else None
 
     # Reports
 
@@ -87,18 +129,22 @@ class Amplifier:
     def scatter(self) -> float:
         """Difference (V) between a report and a voltage that the noise of the reports may make."""
         if len(self._differences) == DIFFERENCES:
-            return TOLERATED_NOISES * median(self._differences) / NORMAL_DIFFERENCE
+            return self.limits.noises * median(self._differences) / NORMAL_DIFFERENCE
         # Of steady voltages there are too few yet: second differences of the last reports, which even motion is not in.
         # Uneven motion is, which must not pass for noise.
         last = [v for _, v in self._reports][-DIFFERENCES:]
         bends = [abs(c - 2.0 * b + a) for a, b, c in zip(last, last[1:], last[2:], strict=False)]
-        noise = TOLERATED_NOISES * median(bends) / NORMAL_BEND if bends else 0.0
-        return min(noise, TOLERATED_SHARE * self.span)
+        noise = self.limits.noises * median(bends) / NORMAL_BEND if bends else 0.0
+        return min(noise, self.limits.share * self.span)
 
     @property
     def tolerance(self) -> float:
         """Largest difference (V) between a report and an output voltage that means nothing."""
-        return max(TOLERATED_SHARE * self.span, self._noise)
+        return self._tolerance()
+
+    def _tolerance(self, gain: float = 1.0) -> float:
+        """Return the tolerance (V) of voltages that are reports divided by a gain."""
+        return max(self.limits.share * self.span, self._noise / gain) + self.slack
 
     @property
     def _noise(self) -> float:
@@ -112,50 +158,34 @@ class Amplifier:
 
     def report(self, voltage: float, now_ns: int) -> None:
         """Take a reported voltage (V) that arrived at `now_ns`; one that is not finite or absurd is no report."""
-        if not (isfinite(voltage) and abs(voltage) <= ABSURD * self.span):
+        if not (isfinite(voltage) and abs(voltage) <= self.limits.absurd * self.span):
             return
         before = self.latest
         self._reports.append((now_ns, voltage))
-        number, told = now_ns // PIECE_NS, self._told
-        if told and told[-1][0] == number:
-            told[-1] = number, min(told[-1][1], voltage), max(told[-1][2], voltage)
-        else:
-            told.append((number, voltage, voltage))
+        self._levels.add(voltage, voltage, now_ns)
         if self._last is None or self.foreign:
             return
         low, high = self._band(now_ns)
         if before is not None and high == low:
             self._differences.append(abs(voltage - before))
         self._pairs.append((now_ns, self._last, voltage))
-        if self._beyond(low, high, voltage, self.calibration) <= 0.0:
-            self._outside = 0
-            return
-        if not self._outside:
-            self._outside_ns = now_ns
-        self._outside += 1
-        if self._outside >= FOREIGN_REPORTS and now_ns - self._outside_ns >= FOREIGN_NS:
+        there, tolerance = self.calibration.voltage(voltage), self._tolerance(self.calibration.gain)
+        outside = "" if low - tolerance <= there <= high + tolerance else "outside"
+        if self._outside.note(outside, now_ns, self.limits.lasts_ns):
             self._judge(low, high, voltage)
 
     def output(self, voltage: float, now_ns: int) -> None:
         """Take a voltage (V) that is output at `now_ns`."""
-        number, last = now_ns // PIECE_NS, self._last
-        pieces = self._pieces
-        if last is None:
-            last = voltage
+        last = voltage if self._last is None else self._last
+        self._last = voltage
+        if voltage == last and self._outputs:
+            return
         if voltage != last:
             self._output_ns = now_ns
-        self._last = voltage
-        if pieces and pieces[-1][0] == number:
-            _, low, high = pieces[-1]
-            if not low <= voltage <= high:
-                pieces[-1] = number, min(low, voltage), max(high, voltage)
-            return
-        if voltage == last and pieces:
-            return
-        pieces.append((number, min(last, voltage), max(last, voltage)))
+        self._outputs.add(min(last, voltage), max(last, voltage), now_ns)
         oldest = (now_ns - self.window_ns) // PIECE_NS
-        while pieces[0][0] < oldest:
-            pieces.popleft()
+        while self._outputs[0][0] < oldest:
+            self._outputs.popleft()
 
     # Where it is
 
@@ -177,9 +207,9 @@ class Amplifier:
         longest_ns = max(REPORT_AGE_NS, REPORTS * (last[-1][0] - last[0][0]) // (REPORTS - 1))
         if now_ns - last[-1][0] > min(longest_ns, SLOW_NS):
             return None
-        told = [each for each in self._told if each[0] * PIECE_NS >= now_ns - for_ns]
-        oldest_ns = min([last[0][0], *(number * PIECE_NS for number, _, _ in told)])
-        values = [v for _, v in last] + [v for _, low, high in told for v in (low, high)]
+        levels = self._levels.since(now_ns - for_ns + PIECE_NS - 1)
+        oldest_ns = min([last[0][0], *(number * PIECE_NS for number, _, _ in levels)])
+        values = [v for _, v in last] + [v for _, low, high in levels for v in (low, high)]
         if now_ns - oldest_ns < for_ns * 0.9 or max(values) - min(values) > 2.0 * self.tolerance:
             return None
         recent = [v for t, v in self._reports if now_ns - t <= for_ns]
@@ -187,48 +217,38 @@ class Amplifier:
 
     def begin(self, voltage: float, now_ns: int) -> None:
         """Continue from a voltage (V) that is known to be there; what was output before no longer counts."""
-        self.foreign, self._outside, self._last = "", 0, None
-        self._pieces.clear()
+        self.forget_output()
+        self.foreign, self._begun_ns = "", now_ns
+        self._outputs.clear()
         self._pairs.clear()
-        self._begun_ns = now_ns
         self.output(voltage, now_ns)
-        self._last = voltage
 
     def forget_output(self) -> None:
         """Compare no reports until the next `begin`: nothing is being output."""
-        self._last, self._outside = None, 0
+        self._last = None
+        self._outside.forget()
 
     def _band(self, now_ns: int) -> tuple[float, float]:
         """Return the lowest and highest voltage (V) that was in force within the window."""
-        oldest = (now_ns - self.window_ns) // PIECE_NS
-        low = high = self._last if self._last is not None else 0.0
-        for number, lowest, highest in self._pieces:
-            # The voltage at the begin of a piece is in it: that before the oldest piece of the window is, too.
-            if number >= oldest:
-                low, high = min(low, lowest), max(high, highest)
-        return low, high
-
-    def _beyond(self, low: float, high: float, reported: float, calibration: Calibration) -> float:
-        """Return by how much (V) a report, with `calibration` a voltage, is outside a band of voltages."""
-        voltage = calibration.voltage(reported)
-        tolerance = max(TOLERATED_SHARE * self.span, self._noise / calibration.gain)
-        return max(low - voltage, voltage - high, tolerance) - tolerance
+        assert self._last is not None
+        # The voltage at the begin of a piece is in it: that before the oldest piece of the window is, too.
+        pieces = self._outputs.since(now_ns - self.window_ns)
+        lows, highs = ([each[place] for each in pieces] for place in (1, 2))
+        return min([self._last, *lows]), max([self._last, *highs])
 
     def _judge(self, low: float, high: float, reported: float) -> None:
         """Find the calibration that explains the reports, or state that the voltage is another one."""
-        found, followed = self._explained()
+        found, followed = self._explained() if self.limits.calibrated else (None, False)
         if found and followed:
-            self.calibration, self._outside = found, 0
+            self.calibration = found
+            self._outside.forget()
             return
         if found and max(low - reported, reported - high) <= CONSTANT_SHARE * self.span:
             # So far from the start on, and little: motion will tell.
             return
-        self._outside = 0
         there = f"{volts(low)} V was output" if high - low < 1e-6 else f"{volts(low)} to {volts(high)} V were output"
-        self.foreign = (
-            f"stage_state reports {volts(reported)} V (effort), but {there}: somebody else moves the stage, its driver "
-            "limits the voltage, or the report is wrong; find out which, then call ~/arm"
-        )
+        last = volts(self._last or 0.0)
+        self.foreign = self.limits.reason.format(reported=volts(reported), there=there, last=last) + self.limits.then
 
     def _explained(self) -> tuple[Calibration | None, bool]:
         """Return a constant gain or offset that explains all reports, and whether they have followed a motion."""
@@ -236,13 +256,13 @@ class Amplifier:
         times, given, reported = np.array(self._pairs).T
         best: tuple[float, float, Calibration, bool] | None = None
         for late in np.arange(0.0, self.window_ns, PIECE_NS):
-            told = times - late - 2.0 * PIECE_NS >= self._begun_ns
-            if np.count_nonzero(told) < FEWEST:
+            used = times - late - 2.0 * PIECE_NS >= self._begun_ns
+            if np.count_nonzero(used) < FEWEST:
                 break
-            early = times[told] - late
-            # The report may tell of any voltage since the one before.
+            early = times[used] - late
+            # The report may be of any voltage since the one before.
             ends = np.array([np.interp(early - since, times, given) for since in (0.0, PIECE_NS, 2.0 * PIECE_NS)])
-            low, high, r = ends.min(axis=0), ends.max(axis=0), reported[told]
+            low, high, r = ends.min(axis=0), ends.max(axis=0), reported[used]
             middle = ends[1]
             power = float(middle @ middle)
             moved = np.abs(middle - middle[-1]) > self.tolerance
@@ -252,20 +272,23 @@ class Amplifier:
             ):
                 if not GAINS[0] <= found.gain <= GAINS[1]:
                     continue
-                near = np.array([self._beyond(*each, found) <= 0.0 for each in zip(low, high, r, strict=True)])
+                v, tolerance = (r - found.offset) / found.gain, self._tolerance(found.gain)
+                near = (low - tolerance <= v) & (v <= high + tolerance)
                 share = float(near.mean())
                 if share < EXPLAINED or (moved.any() and float(near[moved].mean()) < EXPLAINED_MOVING):
                     continue
                 error = float(np.abs(found.gain * middle + found.offset - r).mean())
                 if best is None or (-share, error) < best[:2]:
-                    followed = min(np.ptp(middle), np.ptp(r) / found.gain) >= MOVED * self.tolerance
-                    # Noise divided by a small gain is no motion.
-                    noise = self.scatter if len(self._differences) == DIFFERENCES else 0.0
-                    # At the voltages between, too: a jump of somebody else beside a move of this node is no gain.
-                    span = float(np.ptp(middle))
-                    between = np.abs(middle - 0.5 * (middle.min() + middle.max())) < (0.5 - BETWEEN) * span
-                    along = np.abs((r - found.offset) / found.gain - middle) < BETWEEN * span
-                    followed = followed and np.ptp(r) >= MOVED * noise and np.count_nonzero(between) >= REPORTS
-                    followed = followed and bool(along[between].mean() >= EXPLAINED_MOVING)
-                    best = -share, error, found, bool(followed)
+                    best = -share, error, found, self._followed(middle, r, v, found.gain)
         return best[2:] if best else (None, False)
+
+    def _followed(self, middle: FloatArray, r: FloatArray, v: FloatArray, gain: float) -> bool:
+        """Return whether reports `r` (V), voltages `v` by a gain, have followed a motion of the outputs `middle`."""
+        span, moved = float(np.ptp(middle)), float(np.ptp(r))
+        # Noise divided by a small gain is no motion.
+        if min(span, moved / gain) < MOVED * self.tolerance or moved < MOVED * self._noise:
+            return False
+        # At the voltages between, too: a jump of somebody else beside a move of this node is no gain.
+        between = np.abs(middle - 0.5 * (middle.min() + middle.max())) < (0.5 - BETWEEN) * span
+        along = np.abs(v - middle) < BETWEEN * span
+        return bool(np.count_nonzero(between) >= REPORTS and along[between].mean() >= EXPLAINED_MOVING)

@@ -46,8 +46,8 @@ class Axis:
     def __init__(self, name: str, limits: Limits, loop_settings: LoopSettings, period: float = PERIOD) -> None:
         self.name, self.limits = name, limits
         self.output = RateLimiter(limits, period, limits.clip(0.0))  # the voltage, and where it may go
-        self.amplifier = Amplifier(limits.upper - limits.lower)  # what is reported of the voltage
-        self.loop = Loop(loop_settings, self.output)
+        self.amplifier = Amplifier(limits.upper - limits.lower, axis=name)  # what is reported of the voltage
+        self.loop = Loop(loop_settings, self.output, name)
         self.motion: Motion = Idle()
         self.samples = Samples()
         self.model: AxisModel | None = None

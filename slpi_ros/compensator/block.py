@@ -8,6 +8,7 @@ import numpy as np
 from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.compensator import validation as rejection
 from slpi_ros.compensator.axis import Axis
+from slpi_ros.compensator.monitor import Finding, Rule, Silence
 from slpi_ros.compensator.trajectory import Trajectory
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.io.messages import SECOND_NS
@@ -119,19 +120,20 @@ def _compute(
     return Block(stamp_ns, names, period, np.array(rows), lead_in, missed)
 
 
-class BlockFollower:
-    """Lets the memory of each axis follow a block up to the sample that the driver has told."""
+class BlockFollower(Rule):
+    """Lets the memory of each axis follow a block up to the sample that the driver has told, which it has to go on."""
 
     def __init__(self, block: Block, axes: Mapping[str, Axis], now_ns: int) -> None:
         self.block = block
         self.state, self.sample, self.reason = "", 0, ""
         self._axes = [axes[name] for name in block.names]
         self._rows = block.voltages.tolist()
-        self._heard_ns = now_ns
+        self._silence = Silence(now_ns, self._unheard)
 
     def hear(self, state: str, sample: int, reason: str, now_ns: int) -> None:
         """Take what the driver tells of this block."""
-        self.state, self.reason, self._heard_ns = state, reason, now_ns
+        self.state, self.reason = state, reason
+        self._silence.hear(now_ns)
         last = min(max(sample, self.sample), len(self._rows)) if state in (PLAYING, ENDED, STOPPED) else self.sample
         part = self._rows[self.sample : last]
         for column, axis in enumerate(self._axes):
@@ -143,10 +145,12 @@ class BlockFollower:
         """Whether the driver has told its end."""
         return self.state in (REFUSED, ENDED, STOPPED)
 
-    def silent(self, now_ns: int) -> str:
-        """Return why nothing more is known of the block, "" while the driver tells it."""
-        if now_ns - self._heard_ns < PATIENCE_NS:
-            return ""
+    def check(self, now_ns: int) -> Finding | None:
+        """Return why nothing more is known of the block, None while the driver tells it."""
+        reason = self._silence.beyond(PATIENCE_NS / SECOND_NS, now_ns)
+        return Finding("block", "silent", reason) if reason else None
+
+    def _unheard(self, _: float) -> str:
         if not self.state:
             return (
                 "no driver answers on voltage_trajectory_state; start one that plays blocks, or set trajectory_output "
@@ -158,7 +162,7 @@ class BlockFollower:
         """Let the reports of the amplifiers be held against the samples that may be played by now."""
         ahead = self.sample
         if self.state == PLAYING:
-            ahead += int((now_ns - self._heard_ns) * 1e-9 / self.block.period)
+            ahead += int(self._silence.seconds(now_ns) / self.block.period)
         row = self._rows[min(ahead, len(self._rows) - 1)]
         for column, axis in enumerate(self._axes):
             axis.amplifier.output(row[column], now_ns)

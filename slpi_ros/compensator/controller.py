@@ -13,6 +13,7 @@ from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.block import Block, BlockFollower, plan
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
 from slpi_ros.compensator.messages import Messages
+from slpi_ros.compensator.monitor import Finding, Monitor
 from slpi_ros.compensator.motion import (
     REFUSALS,
     REPLACED_BY,
@@ -103,6 +104,8 @@ class Controller:
         by_name = self.messages.by_name
         self.trajectory = TrajectoryExecutor(period, lambda name: by_name[name].setpoint)
         self.watchdog = CommandWatchdog()
+        # What it finds is answered by `watch`; what is reported of the amplifiers, by `report` at once.
+        self.monitor = Monitor(self.watchdog, *(axis.loop.sensor for axis in self.axes))
         self.block: BlockFollower | None = None  # the last one
         self.stopped: StopReason | None = None  # why all motion was ended last
         self._lifecycle = OperatingMode.UNCONFIGURED
@@ -282,7 +285,7 @@ class Controller:
             axis = self.messages.by_name.get(name)
             if axis:
                 axis.amplifier.report(voltage, now_ns)
-        if not self.ownership.lost():
+        if not self.ownership.lost(now_ns):
             return False
         self.stop(StopReason.LOST, now_ns)
         return True
@@ -463,22 +466,6 @@ class Controller:
             self._end_block(now_ns)
         return block.done
 
-    def watch_block(self, now_ns: int) -> str:
-        """Return why a block is given up now, as nothing is heard of it; "" if not."""
-        block = self.block
-        if self.mode is not OperatingMode.BLOCK or block is None:
-            return ""
-        why = block.silent(now_ns)
-        if not why:
-            block.band(now_ns)
-        elif block.state:
-            # It may still be moving.
-            self.ownership.obstacle = rejection.NOT_ARMED, why
-            self.stop(StopReason.LOST, now_ns)
-        else:
-            self._end_block(now_ns)
-        return why
-
     def _end_block(self, now_ns: int) -> None:
         for axis in self.axes:
             axis.begin(Idle(), now_ns)
@@ -583,23 +570,42 @@ class Controller:
             axis.begin(Reset(goals, rate, axis.stream.voltage), now_ns)
             axis.confidence = MemoryConfidence(RESETTING)
 
-    def watch(self, safety: Safety, fault_time: float, now_ns: int) -> bool:
-        """Look at what should come and does not, and at the sensors; return whether anything has changed.
+    def watch(self, safety: Safety, fault_time: float, now_ns: int) -> list[Finding]:
+        """Return what the monitor newly finds, after the answer to it.
 
-        At the command timeout the voltages are held or go to the safe ones; `fault_time` (s) is that of a sensor before
-        its feedback is switched off.
+        Commands that stop: the voltages are held, or go to the safe ones. A sensor that is faulty for `fault_time` (s;
+        0: never): its feedback is switched off. A block of which nothing is heard: it is given up.
         """
         # A trajectory counts as a command until its last point. The watchdog is suspended during a reset of the memory.
         waiting = self.mode in (OperatingMode.STREAMING, OperatingMode.RAMPING)
-        news = self.watchdog.update(safety, now_ns, waiting)
-        if news and self.watchdog.safe_voltages and self.ownership.owned:
-            self.ramp(safety.voltages, safety.rate, now_ns)
-        elif news:
-            # The voltages are held, not the displacements: nothing follows creep or a sensor without commands.
-            self.stop(StopReason.SILENCE, now_ns)
-        looked_at = [axis for axis in self.axes if not axis.motion.drives]
-        faults = [axis.loop.faulty(fault_time, now_ns) for axis in looked_at if self.ownership.owned]
-        return news or any(faults)
+        self.watchdog.timeout = safety.command_timeout if waiting else 0.0
+        for axis in self.axes:
+            judged = self.ownership.owned and axis.loop.active and not (axis.loop.fault or axis.motion.drives)
+            axis.loop.sensor.fault_time = fault_time if judged else 0.0
+        news = self.monitor.check(now_ns)
+        for found in news:
+            if found.rule == "sensor":
+                self.messages.by_name[found.axis].loop.switch_off(found)
+        if self.watchdog.react(safety):
+            if self.watchdog.safe_voltages and self.ownership.owned:
+                self.ramp(safety.voltages, safety.rate, now_ns)
+            else:
+                # The voltages are held, not the displacements: nothing follows creep or a sensor without commands.
+                self.stop(StopReason.SILENCE, now_ns)
+        block = self.block
+        if block is None or self.mode is not OperatingMode.BLOCK:
+            return news
+        silent = block.check(now_ns)
+        if silent is None:
+            block.band(now_ns)
+            return news
+        if block.state:
+            # It may still be moving.
+            self.ownership.obstacle = rejection.NOT_ARMED, silent.reason
+            self.stop(StopReason.LOST, now_ns)
+        else:
+            self._end_block(now_ns)
+        return [*news, silent]
 
 
 def watch_uncertainty(axes: Sequence[Axis], model: StageModel | None, wanted: bool, now: datetime, now_ns: int) -> str:

@@ -6,7 +6,8 @@ from statistics import median
 
 from slpi_ros.compensator.feedback import Drift, Feedback, LoopSettings, ResidualWindow
 from slpi_ros.compensator.model_swap import continue_from
-from slpi_ros.compensator.sensor_watch import Fault, SensorWatch
+from slpi_ros.compensator.monitor import Finding
+from slpi_ros.compensator.sensor_rule import SensorRule
 from slpi_ros.compensator.statistics import TrackingStatistics
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS
@@ -33,12 +34,12 @@ class Loop:
     _residuals: ResidualWindow
     _sensor: StreamingSensor
 
-    def __init__(self, settings: LoopSettings, output: RateLimiter) -> None:
+    def __init__(self, settings: LoopSettings, output: RateLimiter, axis: str = "") -> None:
         self.settings, self._output = settings, output
         self.closed = False  # whether the total voltage is followed, because there was a reading
         self.active = False  # whether readings correct it
-        self.fault: Fault | None = None  # for which the feedback was switched off
-        self.watch = SensorWatch(1.0)
+        self.fault: Finding | None = None  # for which the feedback was switched off
+        self.sensor = SensorRule(1.0, axis=axis)  # whether its readings follow the model
         self._feedback: Feedback | None = None
         # Measured - model, with the time (ns), also where the measurement is refused.
         self._offsets: deque[tuple[int, float]] = deque(maxlen=OFFSETS)
@@ -90,7 +91,7 @@ class Loop:
     def use(self, model: AxisModel, allowed: Limits, stream: StreamingInverse, now_ns: int) -> None:
         """Follow another `model` with the inverse `stream` of the axis; the voltage is unchanged."""
         low, high = model.displacement_range
-        self.watch.span, self.watch.noise = high - low, model.quality.floor_rms
+        self.sensor.span, self.sensor.noise = high - low, model.quality.floor_rms
         self._sensor = model.streaming_sensor()
         self._setpoint = Sensed(self._sensor, stream.uncoupled_displacement) if self._sensor.late else None
         if self._feedback:
@@ -103,7 +104,7 @@ class Loop:
         """Replace the settings without a voltage step; feedback that was switched off for a fault resumes."""
         if self.fault:
             # What the sensor told before does not count any more.
-            self.watch.begin(now_ns)
+            self.sensor.begin(now_ns)
         self.settings, self.fault, self.active = settings, None, self.closed and settings.enabled
         feedback = self._feedback
         if feedback is None:
@@ -138,7 +139,7 @@ class Loop:
         feedback.begin(now_ns)
         # The feedforward has a rate limiter of its own, beside that of the total voltage.
         feedback.pace, stream.pace = output, output.copy()
-        self.watch.begin(now_ns)
+        self.sensor.begin(now_ns)
         self.closed, self.active = True, settings.enabled
         self.driven_ns = self.due_ns = now_ns
         self._between = 0.0
@@ -182,22 +183,18 @@ class Loop:
         if sensed or not self._expected:
             self._residuals.measure(x)
         if watched:
-            self.watch.read(sensed[-1] if sensed else expected, x, now_ns)
+            self.sensor.read(sensed[-1] if sensed else expected, x, now_ns)
         desired = self._setpoint.at(now_ns) if self._setpoint else None
         if desired is not None or not self._setpoint:
             if not self.fault:
                 self._feedback.measure(x, now_ns, desired)
             tracking.measure(x, desired)
 
-    def faulty(self, fault_time: float, now_ns: int) -> Fault | None:
-        """Switch the feedback off if its sensor has been faulty for `fault_time` (s; 0: never); return a new fault."""
-        if not (self.active and fault_time) or self.fault:
-            return None
-        self.fault = self.watch.judge(now_ns, fault_time)
-        if self.fault:
-            assert self._feedback
-            self._feedback.disable()
-        return self.fault
+    def switch_off(self, fault: Finding) -> None:
+        """Switch the feedback off because of a fault of its sensor."""
+        assert self._feedback
+        self.fault = fault
+        self._feedback.disable()
 
     def forget_offsets(self) -> None:
         """Forget the offsets: the zero has moved."""

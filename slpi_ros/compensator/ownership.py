@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 from slpi_ros.compensator.amplifier import MUTE_NS, STEADY_NS
 from slpi_ros.compensator.axis import Axis
+from slpi_ros.compensator.monitor import Monitor
 from slpi_ros.compensator.validation import NOT_ARMED, STARTING, RejectedError
 from slpi_ros.model.limits import volts
 
@@ -21,6 +22,7 @@ class Ownership:
         self.reporting = self.started = False  # ``stage_state`` has a publisher; a voltage was output
         self.obstacle: tuple[str, str] | None = None  # cause and reason why no voltage may be output
         self.notes: dict[str, str] = {}  # by axis: what is not certain about the voltage at the start
+        self.monitor = Monitor(*(axis.amplifier for axis in axes))  # what it finds stops the output until `arm`
         self._axes = axes
         self._starts = list(starts) or [AUTO] * len(axes)  # `AUTO`, `MEASURED`, `SAVED`, or volts
         self._since_ns, self._ever = 0, False
@@ -59,9 +61,9 @@ class Ownership:
         if start == SAVED:
             return axis.voltage, ""
         found = axis.amplifier.found(now_ns, self._since_ns)
-        if found is not None and not self._possible(axis, found):
-            return None, self._impossible(found)
         if found is not None:
+            if reason := self._impossible(axis, found):
+                return None, reason
             # The last output is known better than a noisy report of it.
             same = self._ever and abs(found - axis.voltage) <= axis.amplifier.scatter
             return (axis.voltage if same else found), ""
@@ -94,27 +96,25 @@ class Ownership:
             for axis in self._axes:
                 self._take(axis, now_ns)
 
-    def lost(self) -> bool:
+    def lost(self, now_ns: int) -> bool:
         """Return whether somebody else has begun to move an axis; nothing may then be output until `arm`."""
-        for axis in self._axes:
-            if axis.amplifier.foreign and self.armed:
-                self.obstacle = NOT_ARMED, f"axis '{axis.name}': {axis.amplifier.foreign}"
-                return True
-        return False
+        self.monitor.check(now_ns)
+        if not (self.monitor.standing and self.armed):
+            return False
+        self.obstacle = NOT_ARMED, str(self.monitor.standing[0])
+        return True
 
     def arm(self, now_ns: int, steady_ns: int = STEADY_NS) -> str:
         """Continue from the steady voltages that are reported; return the reason if there are none, else ""."""
-        found = {axis.name: axis.amplifier.steady(now_ns, steady_ns) for axis in self._axes}
-        for name, voltage in found.items():
+        found: list[float] = []
+        for axis in self._axes:
+            voltage = axis.amplifier.steady(now_ns, steady_ns)
             if voltage is None:
-                return f"axis '{name}': stage_state reports no steady voltage (effort); stop what moves the stage"
-        for axis in self._axes:
-            voltage = found[axis.name]
-            if voltage is not None and not self._possible(axis, voltage):
-                return f"axis '{axis.name}': {self._impossible(voltage)}"
-        for axis in self._axes:
-            voltage = found[axis.name]
-            assert voltage is not None
+                return f"axis '{axis.name}': stage_state reports no steady voltage (effort); stop what moves the stage"
+            if reason := self._impossible(axis, voltage):
+                return f"axis '{axis.name}': {reason}"
+            found.append(voltage)
+        for axis, voltage in zip(self._axes, found, strict=True):
             # The last output of an axis that nobody moved is known better than a noisy report of it.
             if axis.amplifier.foreign or abs(voltage - axis.voltage) > axis.amplifier.scatter:
                 axis.locate(voltage, now_ns)
@@ -123,14 +123,11 @@ class Ownership:
         return ""
 
     @staticmethod
-    def _possible(axis: Axis, voltage: float) -> bool:
-        """Return whether an amplifier of these limits can be at a voltage (V): at most `BEYOND` ranges outside."""
-        lower, upper = axis.limits.lower, axis.limits.upper
-        margin = BEYOND * (upper - lower)
-        return lower - margin <= voltage <= upper + margin
-
-    @staticmethod
-    def _impossible(voltage: float) -> str:
+    def _impossible(axis: Axis, voltage: float) -> str:
+        """Return why no amplifier of these limits can be at a voltage (V): `BEYOND` ranges outside; "" if it can."""
+        margin = BEYOND * axis.limits.span
+        if axis.limits.lower - margin <= voltage <= axis.limits.upper + margin:
+            return ""
         return (
             f"stage_state reports {voltage:.6g} V (effort), more than {BEYOND:g} voltage ranges beyond the limits; "
             "correct its unit, or the limits"

@@ -1,9 +1,11 @@
 """Voltage limits and the rate limiter of an axis."""
 
+from collections.abc import Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from math import inf, sqrt
 
+from slpi_ros.effects.excitation import MEAN_SPEED
 from slpi_ros.errors import UsageError
 
 # Longest time between two samples that counts for effects and for the rate of a path, seconds.
@@ -27,6 +29,16 @@ class Limits:
                 f"voltage limits {self.lower:g}..{self.upper:g} V with slew {self.slew:g} V/s and acceleration "
                 f"{self.acceleration:g} V/s^2 are not valid; give lower <= upper, and positive slew and acceleration"
             )
+
+    @property
+    def span(self) -> float:
+        """Voltage range, volts."""
+        return self.upper - self.lower
+
+    @property
+    def gentle(self) -> float:
+        """Rate (V/s) at which a stage may return to rest: the slew limit, where there is none a moderate one."""
+        return self.slew if self.slew < inf else MEAN_SPEED * self.span
 
     def within(self, voltage_range: tuple[float, float]) -> "Limits":
         """Return these limits, restricted to the voltage range (V) of a model; UsageError if they do not overlap."""
@@ -200,6 +212,36 @@ class RateLimiter:
             return 0.0
         acceleration = self._limits.acceleration
         return min(acceleration * dt * (sqrt(dt * dt + 2.0 * distance / acceleration) - dt), distance)
+
+
+class StageLimiter:
+    """Voltages of all axes at the output, each by its own `RateLimiter`; `voltages` (V) are the last ones."""
+
+    def __init__(self, limits: Sequence[Limits], period: float) -> None:
+        self._limits = tuple(limits)
+        self._each = [RateLimiter(one, period) for one in limits]
+
+    @property
+    def voltages(self) -> tuple[float, ...]:
+        """Voltages that were output last, or found at the amplifier, volts."""
+        return tuple(each.voltage for each in self._each)
+
+    def start(self, voltages: Sequence[float]) -> None:
+        """Continue from voltages (V) that were found at the amplifier, at rest."""
+        for each, v in zip(self._each, voltages, strict=True):
+            each.start(v)
+
+    def step(self, goals: Sequence[float], now_ns: int, *, gently: bool = False) -> tuple[float, ...]:
+        """Move towards the goals (V) at `now_ns`, at most at a gentle rate on demand; return the voltages (V)."""
+        return tuple(
+            each.step(goal, now_ns, limits.gentle if gently else inf)
+            for each, limits, goal in zip(self._each, self._limits, goals, strict=True)
+        )
+
+    def within(self, voltages: Sequence[float], goals: Sequence[float], share: float) -> bool:
+        """Return whether voltages are these goals (V) within a share of each range."""
+        every = zip(voltages, goals, self._limits, strict=True)
+        return all(abs(v - goal) <= share * limits.span for v, goal, limits in every)
 
 
 def decaying_turns(limits: Limits, final: float, cycles: int) -> list[float]:

@@ -2,19 +2,16 @@
 
 import math
 import time
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 from rclpy.clock import Clock, ClockType
-from rclpy.duration import Duration
 from rclpy.node import Node
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.calibration.drive_watch import FARTHEST
+from slpi_ros.calibration.drive_monitor import FARTHEST
 from slpi_ros.calibration.run import Progress
 from slpi_ros.calibration.settings import CalibrationSettings
 from slpi_ros.errors import RecordError, SlpiError, UsageError, length
@@ -22,11 +19,11 @@ from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.bag_files import partial_path
 from slpi_ros.io.bag_writer import BagWriter
 from slpi_ros.io.desired import read_path
-from slpi_ros.io.messages import encode_joint_states
+from slpi_ros.io.messages import JointStateEncoder
 from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.calibration_job import PATH, STATE, CalibrationJob, CalibrationOutcome, Wanted
-from slpi_ros.nodes.common import LATCHED, WARN, Diagnostics, Health, request_stop
-from slpi_ros.nodes.guarded_drive import GuardedDrive
+from slpi_ros.nodes.common import LATCHED, WARN, Diagnostics, Health, request_stop, serve
+from slpi_ros.nodes.guarded_drive import DELIVERY, GuardedDrive
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, limits_of, validated
 from slpi_ros.reports.calibration import PAGE
 
@@ -67,9 +64,8 @@ DECLARATIONS = declare.read_only(
 # Longest step of a drive (in periods of the rate) that follows a late sample.
 MOST_PERIODS = 2.0
 # Time for the last readings of a drive, or of a return to rest, to arrive; period of the held voltage between drives,
-# of the diagnostics and of messages while it waits; time for the delivery of the last message; longest wait for a state
-# at rest; seconds.
-TAIL, HOLD_PERIOD, REPORT_PERIOD, LOG_PERIOD, DELIVERY, LATEST = 0.3, 0.1, 1.0, 5.0, Duration(seconds=1.0), 2.0
+# of the diagnostics and of messages while it waits; longest wait for a state at rest; seconds.
+TAIL, HOLD_PERIOD, REPORT_PERIOD, LOG_PERIOD, LATEST = 0.3, 0.1, 1.0, 5.0, 2.0
 # A path may lose this share of its range when it is sampled.
 MOST_LOST = 0.05
 RESUME = "what was recorded is kept, go on with resume:=true"
@@ -79,22 +75,56 @@ class Interrupted(SlpiError):
     """The calibration was ended before its end: by a request, a signal or a fault."""
 
 
-@dataclass
 class _Job:
-    """A drive on its way: its place in drive time, its bag, and the readings that are still to come, seconds."""
+    """A drive on its way, and its bag in a folder: what is commanded at its present time, and the readings of it."""
 
-    wanted: Wanted
-    bag: BagWriter
-    at: float = 0.0
-    tail: float = TAIL
+    def __init__(self, wanted: Wanted, output: Path, axes: Sequence[str]) -> None:
+        self.wanted, self._bag = wanted, BagWriter(output / wanted.name, topic=f"/{STATE}")
+        self._encoder = JointStateEncoder(axes, "")
+        if wanted.desired.size:
+            self._bag.add_topic(PATH)
+        self._at, self._tail = 0.0, TAIL  # time in the drive, and for the last readings to arrive; seconds
 
     def goals(self) -> list[float]:
         """Return the voltages (V) of the drive at its present time."""
-        return [float(np.interp(self.at, self.wanted.t, v)) for v in self.wanted.voltage.T]
+        return [float(np.interp(self._at, self.wanted.t, v)) for v in self.wanted.voltage.T]
 
-    def desired(self) -> list[float]:
-        """Return the desired displacements (m) at the present time, NaN if there are none."""
-        return [float(np.interp(self.at, self.wanted.t, y)) for y in self.wanted.desired.T]
+    def advance(self, dt: float) -> None:
+        """Go on by a time (s)."""
+        if self._at >= self.wanted.t[-1]:
+            self._tail -= dt
+        self._at += dt
+
+    @property
+    def done(self) -> bool:
+        """Whether the drive and its last readings are over."""
+        return self._tail <= 0.0
+
+    def keep_desired(self, stamp: int, voltages: Sequence[float]) -> None:
+        """Record the desired displacements at the present time, if there are any, with the voltages (V) sent then."""
+        if self.wanted.desired.size:
+            desired = [float(np.interp(self._at, self.wanted.t, y)) for y in self.wanted.desired.T]
+            self.write(stamp, self._encoder.encode(stamp, desired, voltages), PATH)
+
+    def write(self, stamp: int, message: bytes, topic: str) -> None:
+        """Record a message; RecordError if that fails."""
+        try:
+            self._bag.write(stamp, message, topic)
+        except RecordError as error:
+            raise RecordError(f"{error}; its unfinished files are in {self._bag.partial}") from error
+
+    def close(self, *, interrupted: bool) -> None:
+        """Complete the bag, and set it aside if the drive was interrupted; RecordError if that fails or it is empty."""
+        path = self._bag.path
+        try:
+            if not self._bag.message_count:
+                self._bag.discard()
+                raise RecordError(f"calibrator: no {STATE} during {self.wanted.name}")
+            self._bag.close()
+            if interrupted:
+                path.rename(_free(path.with_name(f"interrupted_{path.name}")))
+        except OSError as error:
+            raise RecordError(str(error)) from error
 
 
 def settings_of(values: Values) -> CalibrationSettings:
@@ -146,44 +176,39 @@ class Calibrator(Node):
     ``report.html`` and the last diagnosis.
 
     Nothing is moved while stage_state is missing or another node publishes voltages. If stage_state reports what the
-    voltages cannot have caused (`slpi_ros.calibration.drive_watch`), another publisher appears or a bag cannot be
+    voltages cannot have caused (`slpi_ros.calibration.drive_monitor`), another publisher appears or a bag cannot be
     written, the voltages return to rest within the limits. An interrupted drive is kept as ``interrupted_NAME``.
     """
 
     def __init__(self) -> None:
         super().__init__("calibrator")
-        self._parameter_set = Parameters(self, DECLARATIONS, lambda values: dict(values))
-        values = self._parameter_set.settings
+        values = Parameters(self, DECLARATIONS, lambda values: dict(values)).settings
         self._settings = settings = settings_of(values)
-        self._output = Path(values["output"]).absolute()
+        self._output, self._patience = Path(values["output"]).absolute(), float(values["patience"])
         _prepare(self._output, resume=values["resume"])
-        self._timeout, self._patience = float(values["state_timeout"]), float(values["patience"])
         self._guard = GuardedDrive(
-            self, settings.axes, settings.limits, settings.rate, self._timeout, on_state=self._on_state
+            self, settings.axes, settings.limits, settings.rate, values["state_timeout"], on_state=self._on_state
         )
-        self._goals = list(settings.rest)
         self._job: _Job | None = None
         self._worker: CalibrationJob | None = None
         self._failure: SlpiError | None = None
         self._outcome: CalibrationOutcome | None = None
         self._progress: Progress | None = None
         self._returning = self._paused = False
-        self._begun = self._held = self._stepped = self._moved = time.monotonic()
-        self._said = -math.inf
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        simulated = self.get_parameter("use_sim_time").value
-        self._drive_clock = self.get_clock() if simulated else self._steady
+        self._begun = self._stepped = self._moved = time.monotonic()
+        steady = Clock(clock_type=ClockType.STEADY_TIME)
+        self._drive_clock = self.get_clock() if self.get_parameter("use_sim_time").value else steady
         self._step_ns = 0
         self._models = self.create_publisher(String, "stage_model", LATCHED)
         self._diagnostics = Diagnostics(self, "calibrator")
         for name, answer in (("start", self._on_start), ("pause", self._on_pause), ("stop", self._on_stop)):
-            self.create_service(Trigger, f"~/{name}", answer)
+            serve(self, f"~/{name}", answer)
         self._waiting = bool(values["autostart"])
         period = 1.0 / settings.rate
         # A simulated clock drives a simulated stage; the watch goes on if it stops.
         self.create_timer(period, self._step, clock=self._drive_clock)
-        self.create_timer(period, self._watch, clock=self._steady)
-        self.create_timer(REPORT_PERIOD, self._report, clock=self._steady)
+        self.create_timer(period, self._watch, clock=steady)
+        self.create_timer(REPORT_PERIOD, self._report, clock=steady)
 
     def destroy_node(self) -> None:
         """Return to rest, keep what was recorded, then destroy the node; Interrupted if a signal ended the run."""
@@ -217,12 +242,8 @@ class Calibrator(Node):
             self._outcome = worker.outcome()
 
     def _begin_job(self, wanted: Wanted) -> None:
-        bag = BagWriter(self._output / wanted.name, topic=f"/{STATE}")
-        if wanted.desired.size:
-            bag.add_topic(PATH)
-        self._stepped = time.monotonic()
+        self._job, self._stepped = _Job(wanted, self._output, self._settings.axes), time.monotonic()
         self._guard.begin()
-        self._job = _Job(wanted, bag)
 
     # Drives
 
@@ -235,35 +256,17 @@ class Calibrator(Node):
             self._stepped = time.monotonic()
         if self._returning or job is None or elapsed <= 0.0:
             return
-        dt = min(elapsed, MOST_PERIODS / self._settings.rate)
         if not self._paused:
-            job.at += dt
-            self._goals = job.goals()
-        self._move()
-        if job.wanted.desired.size and not self._paused:
-            self._keep_desired(job)
-        if job.at >= job.wanted.t[-1] and not self._paused:
-            job.tail -= dt
-            if job.tail <= 0.0:
-                self._end_job()
-
-    def _move(self) -> None:
-        self._guard.move(self._goals)
-        self._held = time.monotonic()
-
-    def _keep_desired(self, job: _Job) -> None:
-        """Record desired displacement and command, stamped as they are sent."""
-        stamp = self.get_clock().now().nanoseconds
-        message = encode_joint_states(
-            np.array([stamp]), np.array([job.desired()]), np.array([self._guard.voltages]), self._settings.axes
-        )[0]
-        self._write(job, stamp, message, PATH)
-
-    def _write(self, job: _Job, stamp: int, message: bytes, topic: str) -> None:
+            job.advance(min(elapsed, MOST_PERIODS / self._settings.rate))
+        self._guard.move(job.goals())
+        if self._paused:
+            return
         try:
-            job.bag.write(stamp, message, topic)
+            job.keep_desired(self.get_clock().now().nanoseconds, self._guard.voltages)
         except RecordError as error:
-            self._fail(RecordError(f"{error}; its unfinished files are in {job.bag.partial}"))
+            self._fail(error)
+        if job.done:
+            self._end_job()
 
     def _end_job(self) -> None:
         """Complete the bag of the job, and tell the calibration."""
@@ -271,35 +274,25 @@ class Calibrator(Node):
         if job is None:
             return
         self._guard.end()
-        failure = self._failure
         try:
-            if job.bag.message_count:
-                job.bag.close()
-                if failure is not None:
-                    job.bag.path.rename(_free(job.bag.path.with_name(f"interrupted_{job.bag.path.name}")))
-            else:
-                job.bag.discard()
-                failure = failure or RecordError(f"calibrator: no {STATE} during {job.wanted.name}")
-        except (RecordError, OSError) as error:
-            failure = failure or RecordError(f"{error}; {RESUME}")
-        if failure is not None:
-            self._fail(failure)
-        elif self._worker is not None:
+            job.close(interrupted=self._failure is not None)
+        except RecordError as error:
+            self._fail(error)
+        if self._failure is None and self._worker is not None:
             self._worker.recorded()
 
     # What is watched
 
     def _watch(self) -> None:
         """Check the stage once a period, and step the return to rest, on a clock that does not stop."""
-        now = time.monotonic()
+        now, rest = time.monotonic(), self._settings.rest
         self._guard.listen()
         fault = self._guard.fault() if self._job is not None or self._waiting else None
         if self._returning:
-            if not self._guard.return_step(self._settings.rest):
+            if not self._guard.return_step(rest):
                 self._moved = now
-            self._goals, self._held = list(self._settings.rest), now
             # States of the return still arrive for a while, on a busy machine for longer.
-            self._returning = now - self._moved < (TAIL if self._guard.reports(self._settings.rest) else LATEST)
+            self._returning = not self._guard.settled(rest, self._moved, TAIL, LATEST)
         elif self._failure is not None:
             self._end_job()
             request_stop(self._failure)
@@ -307,26 +300,20 @@ class Calibrator(Node):
             self._finish(self._outcome)
         elif self._waiting:
             self._start_when_ready(now)
-        elif self._job is not None:
-            if now - self._stepped > self._patience:
-                fault = RecordError(f"calibrator: time stands still for {self._patience:g} s; check /clock")
-            if fault is not None:
-                self._fail(fault)
-        else:
+        elif self._job is None:
             self._listen_to_worker()
-        if self._guard.started and now - self._held > HOLD_PERIOD:
-            # A stage that answers commands goes on reporting.
-            self._move()
+        elif now - self._stepped > self._patience:
+            self._fail(RecordError(f"calibrator: time stands still for {self._patience:g} s; check /clock"))
+        elif fault is not None:
+            self._fail(fault)
+        self._guard.hold(HOLD_PERIOD)
 
     def _start_when_ready(self, now: float) -> None:
         """Start once the stage reports and somebody takes the voltages; fail if that lasts too long."""
-        lacking = self._guard.lacking()
-        late = now - self._begun > self._patience
-        found = None if lacking else self._guard.found()
         # A publisher that was killed is known for some seconds more.
-        if self._guard.others and not late:
-            lacking = f"{self._guard.told_others()}; stop it"
-        if found is not None and not self._guard.others:
+        lacking, company = self._guard.lacking(), self._guard.company()
+        found = None if lacking or company else self._guard.found()
+        if found is not None:
             self._waiting = False
             try:
                 self._guard.start(found)
@@ -335,20 +322,21 @@ class Calibrator(Node):
                 return
             self._returning, self._moved = True, now
             self._worker = CalibrationJob(self._settings, self._output)
-        elif late:
-            try:
-                self._guard.require_alone()
-                self._fail(RecordError(f"calibrator: for {self._patience:g} s {lacking}"))
-            except RecordError as error:
-                self._fail(error)
-        elif now - self._said > LOG_PERIOD and now - self._begun > HOLD_PERIOD:
-            self._said = now
-            self.get_logger().info(f"waiting, {self._patience:g} s at most: {lacking}")
+        elif now - self._begun > self._patience:
+            self._fail(self._guard.not_alone() or RecordError(f"calibrator: for {self._patience:g} s {lacking}"))
+        elif now - self._begun > HOLD_PERIOD:
+            lacking = f"{company}; stop it" if company else lacking
+            self.get_logger().info(
+                f"waiting, {self._patience:g} s at most: {lacking}", throttle_duration_sec=LOG_PERIOD
+            )
 
     def _on_state(self, data: bytes, clock_ns: int) -> None:
         """Record a state if a drive is on its way."""
         if self._job is not None and not self._returning:
-            self._write(self._job, clock_ns, data, f"/{STATE}")
+            try:
+                self._job.write(clock_ns, data, f"/{STATE}")
+            except RecordError as error:
+                self._fail(error)
 
     # Ends
 
@@ -380,11 +368,11 @@ class Calibrator(Node):
             return
         doing = "waiting for the stage" if self._waiting or self._worker is not None else "waiting for ~/start"
         state = "paused" if self._paused else "computing" if self._job is None else "driving"
-        values: Mapping[str, object] = {"state": state if progress else "waiting"}
+        values: Mapping[str, object] = {"state": "waiting"}
         if progress:
             doing = progress.doing
             values = {
-                **values,
+                "state": state,
                 "step": progress.step,
                 "seconds_left": f"{progress.seconds_left:.1f}",
                 "mean_error_um": "" if progress.error is None else f"{progress.error * 1e6:.5f}",
@@ -393,25 +381,21 @@ class Calibrator(Node):
 
     # Services
 
-    def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = self._failure is None and self._outcome is None
+    def _on_start(self) -> tuple[bool, str]:
         begun, paused, self._paused = self._waiting or self._worker is not None, self._paused, False
-        if begun and paused:
-            response.message = "goes on"
-        elif begun:
-            response.success, response.message = False, "already started"
-        else:
-            self._waiting, self._begun, response.message = True, time.monotonic(), "started"
-        return response
+        if begun and not paused:
+            return False, "already started"
+        if not begun:
+            self._waiting, self._begun = True, time.monotonic()
+        return self._failure is None and self._outcome is None, "goes on" if begun else "started"
 
-    def _on_pause(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        self._paused, response.success, response.message = True, True, "the voltages are held until ~/start"
-        return response
+    def _on_pause(self) -> tuple[bool, str]:
+        self._paused = True
+        return True, "the voltages are held until ~/start"
 
-    def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_stop(self) -> tuple[bool, str]:
         self._fail(Interrupted("calibrator: stopped by ~/stop"))
-        response.success, response.message = True, "returning to rest"
-        return response
+        return True, "returning to rest"
 
 
 def _prepare(output: Path, *, resume: bool) -> None:

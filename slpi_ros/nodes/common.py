@@ -101,6 +101,16 @@ class DeferredService:
             self._waiting.append(header)
 
 
+def serve(node: Node, name: str, act: Callable[[], tuple[bool, str]]) -> None:
+    """Offer a Trigger service that answers what `act` returns: whether it succeeded, and a text."""
+
+    def answer(_: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+        response.success, response.message = act()
+        return response
+
+    node.create_service(Trigger, name, answer)
+
+
 def refuse_impossible_transitions(node: LifecycleNode) -> None:
     """Refuse requests for a lifecycle transition that the present state does not allow."""
     # Otherwise rclpy ends the process, for instance after two calls of ``ros2 lifecycle set NODE configure``.
@@ -202,6 +212,16 @@ class Health:
         worst_first = sorted(self.problems, key=lambda problem: problem[0], reverse=True)
         return "; ".join(text for _, text in worst_first) or self.summary
 
+    def status(self, name: str) -> DiagnosticStatus:
+        """Return the message of this health under a name."""
+        return DiagnosticStatus(
+            level=self.level,
+            name=name,
+            message=shown(self.message),
+            hardware_id=shown(self.hardware_id),
+            values=[KeyValue(key=shown(key), value=shown(value)) for key, value in self.values.items()],
+        )
+
 
 class Diagnostics:
     """Publish one status on ``/diagnostics``, named after the node and its role."""
@@ -215,14 +235,7 @@ class Diagnostics:
     def report(self, health: Health) -> None:
         """Publish the diagnostic status and store its severity, OK, WARN or ERROR."""
         self.level = health.level
-        status = DiagnosticStatus(
-            level=health.level,
-            name=self._name,
-            message=shown(health.message),
-            hardware_id=shown(health.hardware_id),
-            values=[KeyValue(key=shown(key), value=shown(value)) for key, value in health.values.items()],
-        )
-        array = DiagnosticArray(status=[status])
+        array = DiagnosticArray(status=[health.status(self._name)])
         array.header.stamp = self._node.get_clock().now().to_msg()
         self._publisher.publish(array)
 

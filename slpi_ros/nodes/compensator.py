@@ -6,14 +6,12 @@ from collections.abc import Sequence
 from typing import Any
 
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.clock import Clock, ClockType
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, String
-from std_srvs.srv import Trigger
 from trajectory_msgs.msg import JointTrajectory
 
 from slpi_ros.compensator.amplifier import REARM_NS, Calibration
@@ -31,6 +29,8 @@ from slpi_ros.nodes.common import (
     ask_for_priority,
     keep_freed_memory,
     refuse_impossible_transitions,
+    serve,
+    steady_timer,
 )
 from slpi_ros.nodes.compensator_diagnostics import Reporter
 from slpi_ros.nodes.compensator_memory import Memory
@@ -50,6 +50,8 @@ SIMULATED_PERIOD = 1e-3
 OLDEST_NS, EARLIEST_NS = SECOND_NS // 5, SECOND_NS // 20
 # While voltages are output, reports of the amplifiers are looked at once in this time.
 REPORT_NS = SECOND_NS // 200
+# Time between two looks for topics of quantities and their age.
+LOOK_NS = SECOND_NS // 2
 # Time from the start of the node within which publishers of stage_state are discovered; polling period, seconds.
 # The middleware repeats what a busy machine has missed of its discovery after 3 s.
 DISCOVERY_NS, DISCOVERY_POLL = 7 * SECOND_NS // 2, 0.005
@@ -91,15 +93,14 @@ class Compensator(LifecycleNode):
         self._desired, self._measured = JointStates(), JointStates()
         self._output: Output
         self._inputs: list[Any] = []  # subscriptions of the configured state, the desired displacements first
-        self.create_service(Trigger, "~/arm", self._on_arm)
+        serve(self, "~/arm", self._on_arm)
         self._state_subscription = self.create_subscription(
             JointState, "stage_state", self._on_state, MEASUREMENTS, raw=True
         )
-        self._begun_ns, self._reported_ns = time.monotonic_ns(), 0
-        # The steady clock, as a simulated one may stop while the amplifier moves in real time.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(values["diagnostic_period"], self._on_period, clock=steady)
-        self.create_timer(WATCH_PERIOD, self._watch, clock=steady)
+        self._begun_ns, self._reported_ns, self._looked_ns = time.monotonic_ns(), 0, 0
+        # A simulated clock may stop while the amplifier moves in real time.
+        steady_timer(self, values["diagnostic_period"], self._on_period)
+        steady_timer(self, WATCH_PERIOD, self._watch)
         if values["realtime_priority"]:
             ask_for_priority(self, values["realtime_priority"])
         if values["autostart"]:
@@ -342,18 +343,17 @@ class Compensator(LifecycleNode):
             doubt = axis.confidence.doubt
             self._reporter.log.remark(f"{axis.name} doubt", f"axis '{axis.name}': {doubt}" if doubt else "")
 
-    def _on_arm(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_arm(self) -> tuple[bool, str]:
         """Go on from where somebody else has moved the stage."""
         controller, was_armed = self._controller, self._controller.ownership.armed
         why = controller.arm(time.monotonic_ns())
         at = volts(*controller.voltages)
-        response.success = not why
-        response.message = why or (f"already armed, at {at} V" if was_armed else f"armed at {at} V")
+        said = why or (f"already armed, at {at} V" if was_armed else f"armed at {at} V")
         if not was_armed:
-            self.get_logger().info(f"~/arm: {response.message}")
+            self.get_logger().info(f"~/arm: {said}")
             self._remark_start()
             self._reporter.report()
-        return response
+        return not why, said
 
     # Motion without messages
 
@@ -410,8 +410,10 @@ class Compensator(LifecycleNode):
         self._work_off()
         now_ns = time.monotonic_ns()
         before = controller.mode, reporter.quantities.keys(), controller.trajectory.too_fast
-        self._surroundings.update([topic for topic in values["surroundings"] if topic])
-        reporter.quantities = controller.surroundings.problems(self._surroundings.refused, now_ns)
+        if now_ns - self._looked_ns >= LOOK_NS:
+            self._looked_ns = now_ns
+            self._surroundings.update([topic for topic in values["surroundings"] if topic])
+            reporter.quantities = controller.surroundings.problems(self._surroundings.refused, now_ns)
         self._locate()
         for axis in controller.axes:
             found = axis.amplifier.calibration
@@ -420,8 +422,9 @@ class Compensator(LifecycleNode):
                 said = f"axis '{axis.name}': stage_state {said}: a matter of calibration, it is not followed"
                 reporter.log.remark(f"{axis.name} calibration", said)
         news = controller.watch(self._settings.safety, values["feedback_fault_time"], now_ns)
-        if why := controller.watch_block(now_ns):
-            self.get_logger().error(f"block given up: {why}")
+        for finding in news:
+            if finding.rule == "block":
+                self.get_logger().error(f"block given up: {finding.reason}")
         if values["rearm"] and not controller.ownership.armed and not controller.arm(now_ns, REARM_NS):
             self.get_logger().warning(f"rearmed at {volts(*controller.voltages)} V")
         if news or (controller.mode, reporter.quantities.keys(), controller.trajectory.too_fast) != before:

@@ -4,7 +4,6 @@ import time
 from collections.abc import Mapping
 
 from rclpy.node import Node
-from std_srvs.srv import Trigger
 
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Controller, OperatingMode
@@ -14,7 +13,7 @@ from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import ModelError, SlpiError
 from slpi_ros.model.limits import volts
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.nodes.common import DeferredService
+from slpi_ros.nodes.common import DeferredService, serve
 from slpi_ros.nodes.compensator_diagnostics import Reporter
 
 # Shortest time between two log messages about files, seconds.
@@ -33,7 +32,7 @@ class Memory:
         self._file, self._kept = MemoryFile(path), path != ""
         self.waits = False  # for the voltages at the start, before it begins
         self._service = DeferredService(node, "~/reset_memory", self._on_reset)
-        node.create_service(Trigger, "~/set_zero", self._on_set_zero)
+        serve(node, "~/set_zero", self._on_set_zero)
 
     # The file
 
@@ -91,13 +90,12 @@ class Memory:
 
     # Zeros and resets
 
-    def _on_set_zero(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_set_zero(self) -> tuple[bool, str]:
         """Let the zeros of the models agree with the sensors; nothing moves."""
         try:
             moved = self._controller.set_zero(time.monotonic_ns())
         except SlpiError as error:
-            response.success, response.message = False, f"not set: {error}"
-            return response
+            return False, f"not set: {error}"
         said = [
             f"axis '{name}': the zero moves by {offset * 1e6:+.4f} µm"
             if offset is not None
@@ -107,11 +105,10 @@ class Memory:
         unsure = [axis.name for axis in self._controller.axes if axis.confidence.state not in (KNOWN, RESTORED)]
         if unsure:
             said.append(f"the memory of axis {', '.join(unsure)} is assumed: reset it, then set the zero again")
-        response.success, response.message = None not in moved.values(), "; ".join(said)
-        self._node.get_logger().info(f"~/set_zero: {response.message}")
+        self._node.get_logger().info(f"~/set_zero: {'; '.join(said)}")
         self.save(complete=False)
         self._reporter.report()
-        return response
+        return None not in moved.values(), "; ".join(said)
 
     def _on_reset(self) -> str:
         """Start a reset unless one is running; return the reason if this is not possible, else ""."""

@@ -2,7 +2,7 @@
 
 from collections import deque
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from enum import Enum
 
 import numpy as np
@@ -10,16 +10,18 @@ import numpy as np
 from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.drivers.base import Block, Device, Reading, Recording
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.model.limits import Limits, volts
+from slpi_ros.model.limits import volts
+from slpi_ros.nodes.device_writer import LoopSettings, Writer
 
 # Steps of a block may exceed the slew limit by rounding, and its samples miss the device's clock by this share.
 ROUNDING, OFF_CLOCK = 1e-6, 1e-3
 # The device is asked for its sample once in this time.
 ASK_NS = SECOND_NS // 20
+BUSY = "a block is being played; wait for its end, or stop it with an empty trajectory"
 
 
-class Told(Enum):
-    """What `voltage_trajectory_state` tells of a block."""
+class BlockPhase(Enum):
+    """How far a block is, as `voltage_trajectory_state` says."""
 
     ACCEPTED = "accepted"
     REFUSED = "refused"
@@ -32,7 +34,7 @@ class Told(Enum):
 class BlockState:
     """One state of a block."""
 
-    told: Told
+    phase: BlockPhase
     stamp_ns: int  # of the block
     sample: int  # number of samples that were played
     reason: str = ""
@@ -48,11 +50,9 @@ class BlockRequest:
     voltages: FloatArray  # V, (N, names)
 
 
-def refusal(
-    request: BlockRequest, axes: Sequence[str], limits: Sequence[Limits], present: Sequence[float], period: float
-) -> str:
-    """Return why a block may not be played from the `present` voltages (V), "" if it may; `period` (s) of a cycle."""
-    times, values = request.times_ns, request.voltages
+def refusal(request: BlockRequest, settings: LoopSettings, present: Sequence[float]) -> str:
+    """Return why a block may not be played from the `present` voltages (V), "" if it may."""
+    axes, times, values = settings.axes, request.times_ns, request.voltages
     if not request.names or len(set(request.names)) != len(request.names):
         return f"it names the axes {', '.join(request.names) or 'not'}; name each once"
     if unknown := [name for name in request.names if name not in axes]:
@@ -63,16 +63,17 @@ def refusal(
         return "its times do not increase; give each sample its own time"
     if not np.isfinite(values).all():
         return "a voltage is not finite"
-    for column, name in enumerate(request.names):
-        own, place = limits[axes.index(name)], axes.index(name)
-        v = values[:, column]
-        if v.min() < own.lower - ROUNDING or v.max() > own.upper + ROUNDING:
-            at = int(np.argmax((v < own.lower - ROUNDING) | (v > own.upper + ROUNDING)))
+    # The first sample may be as far as one cycle of single voltages.
+    seconds = np.diff(times, prepend=min(0, times[0] - round(2.0 * SECOND_NS / settings.rate))) / SECOND_NS
+    for name, v in zip(request.names, values.T, strict=True):
+        place = axes.index(name)
+        own = settings.limits[place]
+        beyond = (v < own.lower - ROUNDING) | (v > own.upper + ROUNDING)
+        if beyond.any():
+            at = int(np.argmax(beyond))
             return f"axis '{name}', sample {at}: {volts(v[at])} V is beyond {own.lower:g} to {own.upper:g} V"
         steps = np.abs(np.diff(v, prepend=present[place]))
-        # The first sample may be as far as one cycle of single voltages.
-        allowed = own.slew * np.diff(times, prepend=min(0, times[0] - round(2.0 * period * SECOND_NS))) / SECOND_NS
-        fast = steps > allowed * (1.0 + OFF_CLOCK) + ROUNDING
+        fast = steps > own.slew * seconds * (1.0 + OFF_CLOCK) + ROUNDING
         if fast.any():
             at = int(np.argmax(fast))
             if at == 0:
@@ -80,53 +81,52 @@ def refusal(
                     f"axis '{name}': it begins at {volts(v[0])} V, but the device is at {volts(present[place])} V; "
                     "begin at the present voltage"
                 )
-            rate = steps[at] / (times[at] - times[at - 1]) * SECOND_NS
-            return f"axis '{name}', sample {at}: {rate:.4g} V/s, more than slew_limit {own.slew:g} V/s"
+            return (
+                f"axis '{name}', sample {at}: {steps[at] / seconds[at]:.4g} V/s, more than slew_limit {own.slew:g} V/s"
+            )
     return ""
 
 
-@dataclass
 class BlockPlayer:
-    """One block on its way: loaded and played by the device, or streamed where it cannot; used by one thread."""
+    """One block on its way: loaded and played by the device, or streamed where it cannot; used by one thread.
 
-    request: BlockRequest
-    axes: Sequence[str]
-    present: tuple[float, ...]  # V, of all axes at the start: where those stay that the block does not name
-    states: deque[BlockState]
-    by_device: bool = False
-    ended: bool = False
-    sample: int = 0
-    begun_ns: int = 0  # 0: not yet
-    recording: Recording | None = None
-    _readings: list[Reading] = field(default_factory=list)
-    _loading: Generator[None] | None = None
-    _reading: Generator[None, None, Recording | None] | None = None
-    _asked_ns: int = 0
+    What it does not name stays at the `present` voltages (V). `states` takes what becomes of it.
+    """
 
-    def __post_init__(self) -> None:
-        self.voltages = np.tile(np.array(self.present), (self.request.times_ns.size, 1))
-        for column, name in enumerate(self.request.names):
-            self.voltages[:, self.axes.index(name)] = self.request.voltages[:, column]
-
-    @property
-    def count(self) -> int:
-        """Number of samples."""
-        return len(self.voltages)
+    def __init__(
+        self, request: BlockRequest, axes: Sequence[str], present: tuple[float, ...], states: deque[BlockState]
+    ) -> None:
+        self.stamp_ns, self._times_ns, self._states = request.stamp_ns, request.times_ns, states
+        self.voltages = np.tile(np.array(present), (self._times_ns.size, 1))
+        for column, name in enumerate(request.names):
+            self.voltages[:, axes.index(name)] = request.voltages[:, column]
+        self.count, self.last = len(self.voltages), tuple(self.voltages[-1].tolist())
+        self.by_device = self.ended = False
+        self.sample = self.begun_ns = 0  # 0: not yet
+        self.recording: Recording | None = None
+        self._readings: list[Reading] = []
+        self._life: Generator[None] | None = None  # what the device still has to do
+        self._asked_ns = self._now_ns = 0
 
     @property
     def playing_by_device(self) -> bool:
         """Whether the device moves the voltages by itself now."""
         return self.by_device and self.begun_ns != 0 and not self.ended
 
-    def tell(self, told: Told, reason: str = "") -> None:
-        """Tell a state."""
-        self.states.append(BlockState(told, self.request.stamp_ns, self.sample, reason))
+    @property
+    def done(self) -> bool:
+        """Whether nothing of it is left to do."""
+        return self.ended and self._life is None
+
+    def tell(self, phase: BlockPhase, reason: str = "") -> None:
+        """Say how far it is."""
+        self._states.append(BlockState(phase, self.stamp_ns, self.sample, reason))
 
     def prepare(self, device: Device) -> str:
         """Choose how the block is played; return why it is streamed, "" if the device plays it."""
         if not device.block_period:
             return "the device plays no blocks: streamed"
-        steps = np.diff(self.request.times_ns) / SECOND_NS
+        steps = np.diff(self._times_ns) / SECOND_NS
         if not steps.size:
             return "a single sample: streamed"
         period = float(np.mean(steps))
@@ -137,69 +137,155 @@ class BlockPlayer:
             return "its samples are not evenly spaced: streamed"
         if self.count > device.longest_block:
             return f"{self.count} samples are more than the {device.longest_block} of the device: streamed"
-        self.by_device = True
-        self._loading = device.load(Block(cycles * device.block_period, self.voltages))
+        self.by_device, self._life = True, self._play(device, cycles * device.block_period)
         return ""
 
-    def turn(self, device: Device, now_ns: int) -> None:
+    def turn(self, now_ns: int) -> None:
         """Do the next piece of what the device plays itself; DeviceError if it fails."""
-        if self._loading is not None:
+        self._now_ns = now_ns
+        if self._life is not None:
             try:
-                next(self._loading)
+                next(self._life)
             except StopIteration:
-                self._loading = None
-                device.play()
-                self.begun_ns = self._asked_ns = now_ns
-                self.tell(Told.PLAYING)
-        elif self.ended:
-            self._read()
-        elif now_ns - self._asked_ns >= ASK_NS:
-            self._asked_ns, self.sample = now_ns, device.played()
-            if self.sample >= self.count:
-                self.finish(Told.ENDED, device=device)
-            else:
-                self.tell(Told.PLAYING)
+                self._life = None
+
+    def _play(self, device: Device, period: float) -> Generator[None]:
+        """Load, play and read it, in pieces of one wait of the device each."""
+        yield from device.load(Block(period, self.voltages))
+        device.play()
+        self._tell_playing()
+        while not self.ended:
+            yield
+            if not self.ended and self._now_ns - self._asked_ns >= ASK_NS:
+                self.sample = device.played()
+                if self.sample < self.count:
+                    self._tell_playing()
+                else:
+                    self.finish(BlockPhase.ENDED)
+        yield
+        self.recording = yield from device.recorded()
+
+    def _tell_playing(self) -> None:
+        self.begun_ns, self._asked_ns = self.begun_ns or self._now_ns, self._now_ns
+        self.tell(BlockPhase.PLAYING)
 
     def goal(self, now_ns: int) -> tuple[float, ...]:
         """Return the voltages (V) to stream now."""
+        self._now_ns = now_ns
         if not self.begun_ns:
-            self.begun_ns = self._asked_ns = now_ns
-            self.tell(Told.PLAYING)
-        elapsed, times = now_ns - self.begun_ns, self.request.times_ns
-        self.sample = int(np.searchsorted(times, elapsed, "right"))
+            self._tell_playing()
+        elapsed = now_ns - self.begun_ns
+        self.sample = int(np.searchsorted(self._times_ns, elapsed, "right"))
         if now_ns - self._asked_ns >= ASK_NS and self.sample < self.count:
-            self._asked_ns = now_ns
-            self.tell(Told.PLAYING)
-        columns = range(self.voltages.shape[1])
-        return tuple(float(np.interp(elapsed, times, self.voltages[:, column])) for column in columns)
+            self._tell_playing()
+        return tuple(float(np.interp(elapsed, self._times_ns, column)) for column in self.voltages.T)
 
     def note(self, reading: Reading) -> None:
         """Keep a reading of a block that is streamed, as its record."""
         if self.begun_ns and not self.by_device and not self.ended:
             self._readings.append(reading)
 
-    def finish(self, told: Told, reason: str = "", device: Device | None = None) -> None:
-        """End it; what was recorded is read by the next turns if a device is given."""
+    def finish(self, phase: BlockPhase, reason: str = "") -> None:
+        """End it; what the device recorded is read by the next turns."""
         self.ended = True
-        if self.by_device and device is not None and self.begun_ns:
-            self._reading = device.recorded()
-        elif self._readings:
+        if not self.begun_ns:
+            self._life = None
+        if self._readings:
             times = np.array([each.read_ns - self.begun_ns for each in self._readings]) / SECOND_NS
             positions, voltages = (
                 np.array([getattr(each, name) for each in self._readings]) for name in ("positions", "voltages")
             )
             self.recording = Recording(times, positions, voltages)
-        self.tell(told, reason)
+        self.tell(phase, reason)
 
-    def _read(self) -> None:
-        if self._reading is None:
-            return
-        try:
-            next(self._reading)
-        except StopIteration as stop:
-            self._reading, self.recording = None, stop.value
+
+class Blocks:
+    """The blocks of a device, one at a time: taken or refused, played or streamed, stopped, and what was recorded.
+
+    `submit` and `busy` are for any thread, the others for that of the device. Where a block ends, `writer` goes on.
+    """
+
+    def __init__(self, device: Device, settings: LoopSettings, writer: Writer) -> None:
+        self.states: deque[BlockState] = deque()
+        self.recorded: deque[BlockPlayer] = deque()  # that ended with a recording
+        self._device, self._settings, self._writer = device, settings, writer
+        self._submitted: deque[BlockRequest] = deque()
+        self._block: BlockPlayer | None = None
+
+    def submit(self, request: BlockRequest) -> None:
+        """Take a block to play, or an empty one to stop; what becomes of it appears in `states`."""
+        self._submitted.append(request)
 
     @property
-    def done(self) -> bool:
-        """Whether nothing of it is left to do."""
-        return self.ended and self._reading is None
+    def moving(self) -> bool:
+        """Whether a block is being played or streamed, or loaded for that."""
+        return self._block is not None and not self._block.ended
+
+    @property
+    def busy(self) -> bool:
+        """Whether single voltages have to wait."""
+        return bool(self._submitted) or self.moving
+
+    @property
+    def by_device(self) -> bool:
+        """Whether the device moves the voltages by itself now."""
+        return self._block is not None and self._block.playing_by_device
+
+    def serve(self, held: str, now_ns: int) -> None:
+        """Begin with a block that has come, or say why not, as with the reason `held`; let the device play its own."""
+        while self._submitted:
+            request = self._submitted.popleft()
+            if not request.times_ns.size:
+                self.stop("by an empty trajectory")
+                continue
+            reason = held or (BUSY if self._block else "")
+            reason = reason or refusal(request, self._settings, self._writer.written)
+            if reason:
+                self.states.append(BlockState(BlockPhase.REFUSED, request.stamp_ns, 0, reason))
+                continue
+            self._block = block = BlockPlayer(request, self._settings.axes, self._writer.written, self.states)
+            self._writer.goal = None
+            block.tell(BlockPhase.ACCEPTED, block.prepare(self._device))
+        if self._block is not None:
+            moving = self.moving
+            self._block.turn(now_ns)
+            if moving and not self.moving:
+                self._writer.start(self._block.last)
+
+    def goal(self, now_ns: int) -> tuple[float, ...] | None:
+        """Return the voltages (V) to stream now; None where the device plays the block."""
+        return None if self._block is None or self._block.by_device else self._block.goal(now_ns)
+
+    def note(self, reading: Reading) -> None:
+        """Look at the block after a cycle: whether it has ended, and what was recorded."""
+        block = self._block
+        if block is None:
+            return
+        block.note(reading)
+        if not (block.by_device or block.ended) and block.sample >= block.count and self._writer.at(block.last):
+            block.finish(BlockPhase.ENDED)
+        self._put_away(block)
+
+    def stop(self, reason: str) -> str:
+        """Stop the block that is being played where it is; return which sample that is, "" if there is none."""
+        block = self._block
+        if block is None or block.ended:
+            return ""
+        if block.playing_by_device:
+            block.sample = self._device.halt()
+            self._writer.start(self._device.read().voltages)
+        block.finish(BlockPhase.STOPPED, reason)
+        self._put_away(block)
+        return f"the block was stopped at sample {block.sample} of {block.count}"
+
+    def drop(self, reason: str) -> None:
+        """End the block, as the link is lost."""
+        if self._block is not None and not self._block.ended:
+            self._block.finish(BlockPhase.STOPPED, reason)
+        self._block = None
+
+    def _put_away(self, block: BlockPlayer) -> None:
+        if block.done:
+            if block.recording is not None:
+                self.recorded.append(block)
+            self._block = None

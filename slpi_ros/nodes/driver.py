@@ -2,15 +2,14 @@
 
 import threading
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import partial
 
 import numpy as np
-from diagnostic_msgs.msg import DiagnosticStatus, KeyValue
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
@@ -18,29 +17,31 @@ from trajectory_msgs.msg import JointTrajectory
 from slpi_ros.drivers.base import Channel, Reading
 from slpi_ros.drivers.registry import MODULES, make_device
 from slpi_ros.errors import SlpiError, UsageError, shown
-from slpi_ros.io.messages import SECOND_NS, JointStateEncoder, decode_trajectory, encode_trajectory
+from slpi_ros.io.messages import SECOND_NS, JointStateEncoder, encode_trajectory
 from slpi_ros.model.limits import volts
 from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.common import (
     COMMANDS,
     ERROR,
     LATCHED,
-    OK,
     WARN,
     DeferredService,
     Diagnostics,
     Health,
     ask_for_priority,
+    read_trajectory,
     request_stop,
 )
-from slpi_ros.nodes.device_block import BlockPlayer, BlockRequest, BlockState, Told
-from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings, State
+from slpi_ros.nodes.device_block import BlockPhase, BlockPlayer, BlockRequest, BlockState
+from slpi_ros.nodes.device_link import State
+from slpi_ros.nodes.device_loop import DeviceLoop
+from slpi_ros.nodes.device_writer import LoopSettings
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, limits_of, validated
 
 HOLD, REST = "hold", "rest"
 # Period of diagnostics, and of looks at what the thread of the device has done, seconds.
 REPORT_PERIOD, LOOK_PERIOD, LOG_PERIOD = 0.5, 0.05, 5.0
-# Share of the cycles that may be left out before it is told.
+# Share of the cycles that may be left out without a warning.
 LATE_SHARE = 0.02
 # Characters of a device's own identity in messages.
 LONGEST_IDENTITY = 100
@@ -139,8 +140,8 @@ class Driver(Node):
         self._diagnostics = Diagnostics(self, "driver")
         self._loop = DeviceLoop(device, settings.loop, self._publish)
         self._failure: SlpiError | None = None
-        self._told = self._loop.status
-        self._reported_at, self._cycles_before, self._late_before = time.monotonic(), 0, 0
+        self._status = self._loop.status
+        self._reported_at, self._reported = time.monotonic(), replace(self._loop.counts)
         self._deferred = {
             name: DeferredService(self, f"~/{name}", partial(self._ask, name)) for name in ("arm", "stop")
         }
@@ -192,23 +193,18 @@ class Driver(Node):
             )
 
     def _on_trajectory(self, data: bytes) -> None:
-        self._loop.submit(_read_block(data))
+        read = read_trajectory(data, "effort")
+        self._loop.blocks.submit(BlockRequest(read.start_ns, read.names, read.time_from_start_ns, read.values))
 
     def _tell_block(self, state: BlockState) -> None:
         seconds, rest = divmod(state.stamp_ns, SECOND_NS)
         values = {"stamp": f"{seconds}.{rest:09d}", "sample": str(state.sample), "reason": state.reason}
-        self._block_publisher.publish(
-            DiagnosticStatus(
-                level=WARN if state.told in (Told.REFUSED, Told.STOPPED) else OK,
-                name=f"{self.get_fully_qualified_name()}: block",
-                message=state.told.value,
-                hardware_id=self._frame,
-                values=[KeyValue(key=key, value=shown(value)) for key, value in values.items()],
-            )
-        )
-        if state.told is not Told.PLAYING:
+        problem = ((WARN, state.phase.value),) if state.phase in (BlockPhase.REFUSED, BlockPhase.STOPPED) else ()
+        health = Health(problem, state.phase.value, values, self._frame)
+        self._block_publisher.publish(health.status(f"{self.get_fully_qualified_name()}: block"))
+        if state.phase is not BlockPhase.PLAYING:
             reason = f": {state.reason}" if state.reason else ""
-            self.get_logger().info(f"block {state.told.value} at sample {state.sample}{reason}")
+            self.get_logger().info(f"block {state.phase.value} at sample {state.sample}{reason}")
 
     def _publish_recording(self, block: BlockPlayer) -> None:
         recording = block.recording
@@ -232,15 +228,15 @@ class Driver(Node):
         while self._loop.answers:
             what, success, text = self._loop.answers.popleft()
             self._deferred[what].answer(success, text)
-        while self._loop.block_states:
-            self._tell_block(self._loop.block_states.popleft())
-        while self._loop.recorded:
-            self._publish_recording(self._loop.recorded.popleft())
+        while self._loop.blocks.states:
+            self._tell_block(self._loop.blocks.states.popleft())
+        while self._loop.blocks.recorded:
+            self._publish_recording(self._loop.blocks.recorded.popleft())
         status, now = self._loop.status, time.monotonic()
-        changed = status.state is not self._told.state
+        changed = status.state is not self._status.state
         if changed:
             self._tell()
-        self._told = status
+        self._status = status
         if changed or now - self._reported_at >= REPORT_PERIOD:
             self._report(now)
 
@@ -262,8 +258,8 @@ class Driver(Node):
     def _report(self, now: float) -> None:
         loop, status, found, reading = self._loop, self._loop.status, self._loop.found, self._loop.latest
         elapsed, self._reported_at = now - self._reported_at, now
-        cycles, late = loop.counts.cycles - self._cycles_before, loop.counts.late - self._late_before
-        self._cycles_before, self._late_before = loop.counts.cycles, loop.counts.late
+        before, self._reported = self._reported, replace(loop.counts)
+        cycles, late = self._reported.cycles - before.cycles, self._reported.late - before.late
         since = datetime.fromtimestamp(status.since, UTC).isoformat(timespec="seconds") if status.since else ""
         problems = []
         if status.state is State.LOST:
@@ -301,22 +297,3 @@ class Driver(Node):
         loop.timing.restart()
         summary = f"{self._device_name}: {status.state.value}"
         self._diagnostics.report(Health(tuple(problems), summary, values, self._frame))
-
-
-def _read_block(data: bytes) -> BlockRequest:
-    """Return a serialised JointTrajectory; one that cannot be read names no axis, so that it is refused."""
-    if arrays := decode_trajectory(data, "effort"):
-        return BlockRequest(arrays.start_ns, arrays.names, arrays.time_from_start_ns, arrays.values)
-    try:
-        message = deserialize_message(data, JointTrajectory)
-    except RuntimeError:
-        return BlockRequest(0, (), np.zeros(1, np.int64), np.zeros((1, 0)))
-    stamp, points = message.header.stamp, message.points
-    times = [each.time_from_start.sec * SECOND_NS + each.time_from_start.nanosec for each in points]
-    lengths = {len(each.effort) for each in points}
-    # Points with different numbers of voltages are refused by their shape.
-    width = lengths.pop() if len(lengths) == 1 else 0
-    values = np.array([list(each.effort)[:width] for each in points], float).reshape(len(points), width)
-    return BlockRequest(
-        stamp.sec * SECOND_NS + stamp.nanosec, tuple(message.joint_names), np.array(times, np.int64), values
-    )

@@ -2,24 +2,22 @@
 
 import math
 import time
-from array import array
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from builtin_interfaces.msg import Duration as DurationMsg
+import numpy as np
 from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
-from std_srvs.srv import Trigger
-from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
+from trajectory_msgs.msg import JointTrajectory
 
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
 from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.excitation.drives import DRIVES, SLEW_USED, Drive, Playback, excite
-from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.io.messages import SECOND_NS, encode_trajectory
 from slpi_ros.model.limits import Limits, volts
 from slpi_ros.nodes import parameters as declare
-from slpi_ros.nodes.common import COMMANDS, request_stop
-from slpi_ros.nodes.guarded_drive import DELIVERY, GuardedDrive
+from slpi_ros.nodes.common import COMMANDS, request_stop, serve
+from slpi_ros.nodes.guarded_drive import GuardedDrive
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, limits_of, validated
 
 LIVE = "live"
@@ -106,7 +104,7 @@ class Exciter(Node):
     earlier would not hold the memory at its end.
 
     It drives only while no other node publishes the topic of its voltages, and while ``stage_state`` reports what the
-    voltages can have caused (`slpi_ros.calibration.drive_watch`). Else it returns to rest at the slew limit and ends
+    voltages can have caused (`slpi_ros.calibration.drive_monitor`). Else it returns to rest at the slew limit and ends
     with exit code 1 (without ``autostart`` it stays). A trajectory is not watched: the device plays it by itself.
     Services ``~/start`` and ``~/stop`` (std_srvs/Trigger); parameters in `DECLARATIONS`.
     """
@@ -115,43 +113,41 @@ class Exciter(Node):
         super().__init__("exciter")
         self._parameter_set = Parameters(self, DECLARATIONS, ExciterSettings.of)
         self._parameter_set.follow(lambda settings: None)
-        settings = self._parameter_set.settings
+        values = self._values
         self._playback: Playback | None = None
         self._timer = None
-        self._live = self._values["output"] == LIVE
+        self._live = values["output"] == LIVE
         publisher = None if self._live else self.create_publisher(JointTrajectory, "voltage_trajectory", COMMANDS)
         self._guard = GuardedDrive(
-            self, settings.values["axes"], settings.limits, settings.values["rate"], settings.values["state_timeout"],
+            self, values["axes"], self._parameter_set.settings.limits, values["rate"], values["state_timeout"],
             publisher=publisher,
         )  # fmt: skip
-        self.create_service(Trigger, "~/start", self._on_start)
-        self.create_service(Trigger, "~/stop", self._on_stop)
+        serve(self, "~/start", self._on_start)
+        serve(self, "~/stop", self._on_stop)
         # A simulated clock may stop, and the system clock may be set back.
         self._steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._polls_left = self._listeners = 0
+        self._listeners, self._same_since = 0, 0.0  # number of subscribers, and since when it is the same
         self._waiting = self.create_timer(POLL_PERIOD, self._poll, clock=self._steady, autostart=False)
         self._refusal: SlpiError | None = None
         self._rest: list[float] = []
         self._returning = self._arriving = False
+        self._begun = 0.0  # of waiting, of the excitation, of its end
         self.create_timer(WATCH_PERIOD, self._watch, clock=self._steady)
-        self._away = self._said = 0.0
         self._leaving = self.create_timer(POLL_PERIOD, self._poll_report, clock=self._steady, autostart=False)
-        if self._values["autostart"]:
+        if values["autostart"]:
             self._wait()
 
     def destroy_node(self) -> None:
         """Return the axes to rest, then destroy the node."""
-        if self.context.ok() and self._playback:
-            if self._live:
+        if self.context.ok():
+            if self._playback and self._live:
                 self._guard.return_to(self._rest)
-            else:
+            elif self._playback:
                 self._return(self._playback)
                 while not self._playback.done:
                     self._playback.next()
                     time.sleep(1.0 / self._playback.drive.rate)
-        if self.context.ok():
-            # Voltages that have not been delivered are lost when the process ends.
-            self._guard.publisher.wait_for_all_acked(DELIVERY)
+            self._guard.deliver()
         super().destroy_node()
 
     @property
@@ -160,37 +156,26 @@ class Exciter(Node):
 
     # Before the excitation
 
-    def _on_start(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        if self._playback or self._polls_left:
-            response.message = "already started; call ~/stop first"
-        else:
-            self._wait()
-            response.success = True
-            response.message = f"drive '{self._values['drive']}' of {self._values['duration']:g} s"
-        return response
+    def _on_start(self) -> tuple[bool, str]:
+        if self._playback or not self._waiting.is_canceled():
+            return False, "already started; call ~/stop first"
+        self._wait()
+        return True, f"drive '{self._values['drive']}' of {self._values['duration']:g} s"
 
     def _wait(self) -> None:
         self._guard.prepare(self._parameter_set.settings.limits, self._values["rate"])
-        self._listeners, self._said = 0, -math.inf
-        self._polls_left, self._begun = 1, time.monotonic()
+        self._listeners, self._begun = 0, time.monotonic()
         self._waiting.reset()
 
     def _poll(self) -> None:
         """Start once the number of subscribers has not changed for the time `settle`, so that none misses samples."""
-        listeners = self._guard.publisher.get_subscription_count()
-        if listeners and listeners == self._listeners:
-            self._polls_left = max(self._polls_left - 1, 1)
-        elif listeners:
-            self._polls_left = 1 + round(self._values["settle"] / POLL_PERIOD)
-        settled, self._listeners = listeners > 0 and self._polls_left == 1, listeners
-        lacking = self._lacking()
-        now = time.monotonic()
-        if lacking and now - self._said > LOG_PERIOD:
-            self._said = now
-            self.get_logger().info(f"waiting: {lacking}")
-        if settled and not lacking:
+        now, listeners = time.monotonic(), self._guard.publisher.get_subscription_count()
+        if listeners != self._listeners:
+            self._listeners, self._same_since = listeners, now
+        if lacking := self._lacking():
+            self.get_logger().info(f"waiting: {lacking}", throttle_duration_sec=LOG_PERIOD)
+        elif listeners and now - self._same_since >= self._values["settle"]:
             self._waiting.cancel()
-            self._polls_left = 0
             self._begin()
 
     def _lacking(self) -> str:
@@ -205,11 +190,10 @@ class Exciter(Node):
     # Excitation
 
     def _begin(self) -> None:
-        values, settings = self._values, self._parameter_set.settings
+        settings, heard = self._parameter_set.settings, self._guard.heard
         found = self._guard.found() or settings.rest
         assert found
         try:
-            self._guard.require_alone()
             self._guard.start(found)
             drive = settings.drawn(found)
             self._rest = [float(v[0]) for v in drive.voltage.values()]
@@ -221,21 +205,21 @@ class Exciter(Node):
         except SlpiError as error:
             self._give_up(error)
             return
-        if not self._guard.heard:
+        if not heard:
             self.get_logger().warning(
                 "nobody publishes stage_state: the amplifier is taken to be at rest_voltage, and nothing watches the "
                 "sensor"
             )
         self._refusal, self._returning, self._arriving = None, False, self._live
-        self._playback, self._begun = Playback(drive, repeat=values["repeat"]), time.monotonic()
-        if self._live and self._guard.heard:
+        self._playback, self._begun = Playback(drive, repeat=self._values["repeat"]), time.monotonic()
+        if self._live and heard:
             self._guard.begin()
         self._timer = self.create_timer(1.0 / drive.rate, self._step, clock=self._steady)
         self._publish_trajectory(self._playback)
-        self.get_logger().info(f"exciting {', '.join(drive.axes)} for {values['duration']:g} s. {drive.why}")
+        self.get_logger().info(f"exciting {', '.join(drive.axes)} for {self._values['duration']:g} s. {drive.why}")
 
     def _watch(self) -> None:
-        """Return to rest if the stage does not do what it is told, or another publisher of voltages has appeared."""
+        """Return to rest if the stage does not follow, or another publisher of voltages has appeared."""
         self._guard.listen()
         fault = self._guard.fault()
         if fault is not None and self._playback and not (self._returning or self._playback.stopping):
@@ -254,23 +238,20 @@ class Exciter(Node):
         playback = self._playback
         if playback is None:
             return
-        if not self._live:
-            playback.next()
-            if playback.done:
-                self._end(playback)
-        elif self._returning:
-            if self._guard.return_step(self._rest):
-                self._end(playback)
+        if self._returning:
+            ended = self._guard.return_step(self._rest)
         elif self._arriving and not self._guard.at(self._rest):
             # To rest_voltage, from where the amplifier is.
             self._guard.return_step(self._rest)
-            self._begun = time.monotonic()
+            self._begun, ended = time.monotonic(), False
         else:
             self._arriving = False
             sample = playback.next()
-            self._guard.move(sample)
-            if playback.done and self._guard.at(sample):
-                self._end(playback)
+            if self._live:
+                self._guard.move(sample)
+            ended = playback.done and (not self._live or self._guard.at(sample))
+        if ended:
+            self._end(playback)
 
     def _publish_trajectory(self, playback: Playback) -> None:
         if not self._live:
@@ -292,31 +273,25 @@ class Exciter(Node):
                     f"the excitation took {took:.1f} s instead of {planned:.1f} s; use a lower rate on this machine"
                 )
             if self._values["autostart"]:
-                self._begun = self._away = time.monotonic()
+                self._begun = time.monotonic()
                 self._leaving.reset()
 
     def _poll_report(self) -> None:
         """Stop once ``stage_state``, if it was ever received, has reported the last voltages for some time."""
-        now, reported = time.monotonic(), self._guard.reported
-        if reported is not None and not self._guard.reports(self._rest):
-            self._away = now
-        if reported is None or now - self._away >= REPORT_LASTS:
-            request_stop()
-        elif now - self._begun > REPORT_PATIENCE:
-            self.get_logger().warning(
-                f"stage_state reports {volts(*reported)} V, {REPORT_PATIENCE:g} s after the "
-                f"end at {volts(*self._rest)} V; a record that ends now does not hold the end"
-            )
+        reported = self._guard.reported
+        if reported is None or self._guard.settled(self._rest, self._begun, REPORT_LASTS, REPORT_PATIENCE):
+            if reported is not None and not self._guard.reports(self._rest):
+                self.get_logger().warning(
+                    f"stage_state reports {volts(*reported)} V, {REPORT_PATIENCE:g} s after the "
+                    f"end at {volts(*self._rest)} V; a record that ends now does not hold the end"
+                )
             request_stop()
 
     # Stop
 
-    def _on_stop(self, _: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
-        response.success = True
+    def _on_stop(self) -> tuple[bool, str]:
         self._waiting.cancel()
-        self._polls_left = 0
-        response.message = f"back in {self._return(self._playback):.1f} s" if self._playback else "at rest"
-        return response
+        return True, f"back in {self._return(self._playback):.1f} s" if self._playback else "at rest"
 
     def _return(self, playback: Playback) -> float:
         """Start the return to rest; return its duration, seconds."""
@@ -328,16 +303,8 @@ class Exciter(Node):
         return playback.seconds_left
 
 
-def trajectory_of(playback: Playback) -> JointTrajectory:
-    """Return the remaining samples as a trajectory that starts now: volts in ``effort``, no positions."""
-    rate = playback.drive.rate
-    points = [
-        JointTrajectoryPoint(effort=array("d", voltages), time_from_start=_duration(number / rate))
-        for number, voltages in enumerate(playback.samples_left.tolist(), 1)
-    ]
-    return JointTrajectory(joint_names=list(playback.drive.axes), points=points)
-
-
-def _duration(seconds: float) -> DurationMsg:
-    whole_seconds, nanoseconds = divmod(round(seconds * SECOND_NS), SECOND_NS)
-    return DurationMsg(sec=whole_seconds, nanosec=nanoseconds)
+def trajectory_of(playback: Playback) -> bytes:
+    """Return the remaining samples as a serialised trajectory that starts now: volts in ``effort``, no positions."""
+    voltages, drive = playback.samples_left, playback.drive
+    times_ns = np.round(np.arange(1, len(voltages) + 1) * (SECOND_NS / drive.rate)).astype(np.int64)
+    return encode_trajectory(0, drive.axes, times_ns, np.empty((len(voltages), 0)), voltages)

@@ -13,12 +13,11 @@ from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
-from slpi_ros.calibration.drive_watch import DriveWatch
+from slpi_ros.calibration.drive_monitor import DriveMonitor
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
-from slpi_ros.effects.excitation import MEAN_SPEED
-from slpi_ros.errors import RecordError, SlpiError
+from slpi_ros.errors import RecordError
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.model.limits import Limits, RateLimiter
+from slpi_ros.model.limits import Limits, StageLimiter
 from slpi_ros.nodes.common import COMMANDS, publishers_beside
 
 STATE, COMMAND = "stage_state", "voltage_command"
@@ -29,12 +28,14 @@ OnState = Callable[[bytes, int], None]
 
 
 class GuardedDrive:
-    """Drive a stage within its limits, alone, from where it is, and only while it does what it is told."""
+    """Drive a stage within its limits, alone, from where it is, and only while it does what it is commanded.
 
-    # Every voltage passes `move`, the last place before it is published, which keeps the limits by the steady clock; it
-    # is called at `rate` (Hz). `timeout` (s) is the longest time without a valid state during a drive. `on_state` is
-    # called with each serialized state and its time on the clock of the node. The name of the node begins messages of
-    # errors.
+    Every voltage passes `move`, the last place before it is published, which keeps the limits by the steady clock; it
+    is called at `rate` (Hz). `timeout` (s) is the longest time without a valid state during a drive. `on_state` is
+    called with each serialized state and its time on the clock of the node. The name of the node begins messages of
+    errors.
+    """
+
     def __init__(
         self,
         node: Node,
@@ -47,30 +48,31 @@ class GuardedDrive:
     ) -> None:
         self._node, self._axes, self._on_valid = node, tuple(axes), on_state
         self._timeout = timeout
-        self._simulated = bool(node.get_parameter("use_sim_time").value)
         self.publisher: Any = publisher or node.create_publisher(Float64MultiArray, COMMAND, COMMANDS)
         self._subscription = None
         self.reported: list[float] | None = None  # V, last valid
-        self.hardware_id, self._count = "", 0
+        self.hardware_id = ""
         self.prepare(limits, rate)
 
     def prepare(self, limits: Sequence[Limits], rate: float) -> None:
         """Begin a run within the given limits, at a rate (Hz): nothing is known of the stage."""
-        self._limits, self._rate = tuple(limits), rate
-        self._limiters = [RateLimiter(each, 1.0 / self._rate) for each in limits]
-        self._started = False
+        self._limits, self._period = tuple(limits), 1.0 / rate
+        self._limiter = StageLimiter(limits, self._period)
+        self._goals: Sequence[float] | None = None  # V, None: voltages may not be published yet
         self._since_ns = time.monotonic_ns()
-        self.watch = DriveWatch(self._axes, limits, self._timeout, simulated=self._simulated)
+        self._published = self._away = time.monotonic()  # s, of the last voltages; of the last report of others
+        simulated = bool(self._node.get_parameter("use_sim_time").value)
+        self.monitor = DriveMonitor(self._axes, limits, self._timeout, simulated=simulated)
 
     @property
-    def voltages(self) -> list[float]:
+    def voltages(self) -> tuple[float, ...]:
         """Voltages that were published last, volts; those found at the amplifier before."""
-        return [limiter.voltage for limiter in self._limiters]
+        return self._limiter.voltages
 
     @property
     def started(self) -> bool:
         """Whether voltages may be published."""
-        return self._started
+        return self._goals is not None
 
     @property
     def heard(self) -> bool:
@@ -90,23 +92,21 @@ class GuardedDrive:
 
     # Before a drive
 
-    @property
-    def others(self) -> int:
-        """Number of other publishers of the topic of the voltages."""
-        return self._node.count_publishers(self.publisher.topic_name) - 1
-
-    def require_alone(self) -> None:
-        """Raise RecordError if another node publishes the topic of the voltages."""
-        if self.others > 0:
-            raise RecordError(
-                f"{self._node.get_name()}: {self.told_others()}; stop it, as the voltage would jump between the "
-                "commands of both"
-            )
-
-    def told_others(self) -> str:
-        """Return the number and the names of the other publishers of the topic of the voltages as text."""
+    def company(self) -> str:
+        """Return the number and the names of the other publishers of the topic of the voltages, "" if alone."""
         topic = self.publisher.topic_name
-        return f"{self.others} other publisher of {topic}, {', '.join(publishers_beside(self._node, topic))}"
+        others = self._node.count_publishers(topic) - 1
+        if others <= 0:
+            return ""
+        return f"{others} other publisher of {topic}, {', '.join(publishers_beside(self._node, topic))}"
+
+    def not_alone(self) -> RecordError | None:
+        """Return the error if another node publishes the topic of the voltages."""
+        if not (company := self.company()):
+            return None
+        return RecordError(
+            f"{self._node.get_name()}: {company}; stop it, as the voltage would jump between the commands of both"
+        )
 
     def lacking(self) -> str:
         """Return what is missing before a drive may start, with what to do; "" if nothing is."""
@@ -115,98 +115,93 @@ class GuardedDrive:
             return f"no publisher of {topic}; start the driver of the stage, or remap its topic"
         if not self.publisher.get_subscription_count():
             return f"no subscriber of {self.publisher.topic_name}; start the driver of the stage, or remap its topic"
-        if self.watch.refused:
-            return f"no valid {topic}: {self.watch.refused}"
+        if self.monitor.refused:
+            return f"no valid {topic}: {self.monitor.refused}"
         if self.found() is None:
             return f"no report of the voltage of the axes {', '.join(self._axes)} on {topic}; check the driver"
         return ""
 
     def found(self) -> list[float] | None:
         """Return the voltages (V) at which the amplifier is, as reported; None if they are not known yet."""
-        return self.watch.started_from(time.monotonic_ns(), self._since_ns)
+        return self.monitor.started_from(time.monotonic_ns(), self._since_ns)
 
     def start(self, voltages: Sequence[float]) -> None:
-        """Start from voltages (V) at which the amplifier is; RecordError if one is far outside the limits."""
+        """Start from voltages (V) at which the amplifier is; RecordError beside others, or if one is far outside."""
+        if error := self.not_alone():
+            raise error
         for axis, limits, v in zip(self._axes, self._limits, voltages, strict=True):
-            slack = TOLERATED_SHARE * (limits.upper - limits.lower)
+            slack = TOLERATED_SHARE * limits.span
             if not limits.lower - slack <= v <= limits.upper + slack:
                 raise RecordError(
                     f"{self._node.get_name()}: axis '{axis}' is at {v:g} V, outside {limits.lower:g} to "
                     f"{limits.upper:g} V; move it inside first"
                 )
-        for limiter, limits, v in zip(self._limiters, self._limits, voltages, strict=True):
-            limiter.start(limits.clip(v))
-        self._started = True
+        self._goals = [limits.clip(v) for limits, v in zip(self._limits, voltages, strict=True)]
+        self._limiter.start(self._goals)
 
     # A drive
 
     def begin(self) -> None:
         """Begin to hold the states against the voltages."""
-        self.watch.begin(self.voltages, time.monotonic_ns())
+        self.monitor.begin(self.voltages, time.monotonic_ns())
 
     def end(self) -> None:
         """End a drive: the stage is no longer watched."""
-        self.watch.end()
+        self.monitor.end()
 
-    def move(self, goals: Sequence[float], fastest: Sequence[float] | None = None) -> list[float]:
-        """Move all axes towards their goals (V), at most as fast as given (V/s), and publish the voltages."""
+    def move(self, goals: Sequence[float], *, gently: bool = False) -> None:
+        """Move all axes towards their goals (V), on demand at a gentle rate, and publish the voltages."""
         now_ns = time.monotonic_ns()
-        rates = fastest or [math.inf] * len(self._axes)
-        voltages = [
-            limiter.step(goal, now_ns, rate) for limiter, goal, rate in zip(self._limiters, goals, rates, strict=True)
-        ]
-        self.watch.command(voltages, now_ns)
+        self._goals, self._published = goals, now_ns * 1e-9
+        voltages = self._limiter.step(goals, now_ns, gently=gently)
+        self.monitor.command(voltages, now_ns)
         self.publisher.publish(Float64MultiArray(data=array("d", voltages)))
-        return voltages
 
-    def fault(self) -> SlpiError | None:
+    def hold(self, period: float) -> None:
+        """Publish the voltages again if that was `period` (s) ago: a stage that answers commands goes on reporting."""
+        if self._goals is not None and time.monotonic() - self._published > period:
+            self.move(self._goals)
+
+    def fault(self) -> RecordError | None:
         """Return what speaks against going on with a drive, None if nothing does; call it again and again."""
-        fault = self.watch.check(time.monotonic_ns())
-        if fault:
-            return RecordError(f"{self._node.get_name()}: {fault}")
-        try:
-            self.require_alone()
-        except RecordError as error:
-            return error
-        return None
+        fault = self.monitor.check(time.monotonic_ns())
+        return RecordError(f"{self._node.get_name()}: {fault}") if fault else self.not_alone()
 
     # Return
 
     def return_step(self, rest: Sequence[float]) -> bool:
         """Move towards rest (V) at the slew limit, gently if there is none; return whether all axes are there."""
-        fastest = [min(each.slew, MEAN_SPEED * (each.upper - each.lower)) if each.slew == math.inf else each.slew
-                   for each in self._limits]  # fmt: skip
-        self.move(rest, fastest)
+        self.move(rest, gently=True)
         return self.at(rest)
 
     def return_to(self, rest: Sequence[float]) -> None:
         """Return to rest (V), blocking; for the end of the node."""
-        while self._started and not self.at(rest):
+        while self.started and not self.at(rest):
             self.return_step(rest)
-            time.sleep(1.0 / self._rate)
+            time.sleep(self._period)
+        self.deliver()
+
+    def deliver(self) -> None:
+        """Wait for the delivery of the last voltages, which are lost when the process ends."""
         self.publisher.wait_for_all_acked(DELIVERY)
 
     def return_seconds(self, rest: Sequence[float]) -> float:
         """Return how long the way to rest (V) takes from here, seconds."""
         ways = zip(self.voltages, rest, self._limits, strict=True)
-        return max(
-            abs(v - to) / (each.slew if each.slew < math.inf else MEAN_SPEED * (each.upper - each.lower))
-            for v, to, each in ways
-        )
+        return max(abs(v - to) / limits.gentle for v, to, limits in ways)
 
     def at(self, voltages: Sequence[float], share: float = ARRIVED) -> bool:
         """Return whether the voltages published last are the given ones (V), within a share of the range."""
-        return self._within(self.voltages, voltages, share)
+        return self._limiter.within(self.voltages, voltages, share)
 
     def reports(self, voltages: Sequence[float]) -> bool:
         """Return whether the last valid state reports the given voltages (V), within `TOLERATED_SHARE` of the range."""
-        return self.reported is not None and self._within(self.reported, voltages, TOLERATED_SHARE)
+        return self.reported is not None and self._limiter.within(self.reported, voltages, TOLERATED_SHARE)
 
-    def _within(self, v: Sequence[float], goal: Sequence[float], share: float) -> bool:
-        return all(
-            abs(each - to) <= share * (limits.upper - limits.lower)
-            for each, to, limits in zip(v, goal, self._limits, strict=True)
-        )
+    def settled(self, rest: Sequence[float], since: float, lasts: float, patience: float) -> bool:
+        """Return whether states have reported rest (V) for `lasts` (s) `since` (monotonic, s); or for `patience`."""
+        now = time.monotonic()
+        return (self.reports(rest) and now - max(since, self._away) >= lasts) or now - since >= patience
 
     def _on_state(self, data: bytes) -> None:
         try:
@@ -217,7 +212,9 @@ class GuardedDrive:
         v, y = ([float(values.get(axis, math.nan)) for axis in self._axes] for values in (volts, metres))
         stamp = state.header.stamp
         clock_ns = self._node.get_clock().now().nanoseconds
-        if self.watch.state(stamp.sec * SECOND_NS + stamp.nanosec, clock_ns, v, y, time.monotonic_ns()):
+        if self.monitor.state(stamp.sec * SECOND_NS + stamp.nanosec, clock_ns, v, y, time.monotonic_ns()):
             self.reported, self.hardware_id = v, state.header.frame_id
+            if not self.reports(self.voltages):
+                self._away = time.monotonic()
         if self._on_valid is not None:
             self._on_valid(data, clock_ns)

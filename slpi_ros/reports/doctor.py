@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.calibration.drive_watch import FARTHEST
+from slpi_ros.calibration.drive_monitor import FARTHEST
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
 from slpi_ros.identification.record_quality import assess, findings
 from slpi_ros.io.record import Record

@@ -11,8 +11,10 @@ from drivers.kinds import KINDS
 
 from slpi_ros.drivers import gcs_waves, labjack, nidaqmx, stream
 from slpi_ros.model.limits import Limits
-from slpi_ros.nodes.device_block import BlockRequest, Told
-from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings, State
+from slpi_ros.nodes.device_block import BlockPhase, BlockRequest
+from slpi_ros.nodes.device_link import State
+from slpi_ros.nodes.device_loop import DeviceLoop
+from slpi_ros.nodes.device_writer import LoopSettings
 from slpi_ros.simulation.devices.base import LOST, SILENT, Fault
 
 RATE, SLEW = 500.0, 2000.0
@@ -29,7 +31,7 @@ class Bench:
         given = LoopSettings(axes, (Limits(0.0, 100.0, SLEW),) * len(axes), RATE, **settings)
         self.axes = axes
         self.loop = DeviceLoop(kind.make(simulator), given, self.readings.append, self.now_ns)
-        self.loop.block_states = self.states
+        self.loop.blocks.states = self.states
 
     def now_ns(self):
         return time.monotonic_ns() if self._now_ns is None else self._now_ns
@@ -53,12 +55,12 @@ class Bench:
 
     @property
     def told(self):
-        return [state.told for state in self.states]
+        return [state.phase for state in self.states]
 
     def submit(self, voltages, period, names=None, stamp=7):
         voltages = np.asarray(voltages, float)
         times = np.round(np.arange(len(voltages)) * period * 1e9).astype(np.int64)
-        self.loop.submit(BlockRequest(stamp, names or self.axes[: voltages.shape[1]], times, voltages))
+        self.loop.blocks.submit(BlockRequest(stamp, names or self.axes[: voltages.shape[1]], times, voltages))
 
     def path(self, place=0):
         axis = self.simulator.axes[place]
@@ -95,8 +97,8 @@ def test_a_device_plays_a_block_by_its_clock_bit_for_bit(bench, count):
     period = 5e-5
     v = wave(count, period, 20.0, 30.0)
     bench.submit(v, period)
-    bench.until(lambda: bench.loop.recorded)
-    assert bench.told[:2] == [Told.ACCEPTED, Told.PLAYING] and bench.told[-1] is Told.ENDED
+    bench.until(lambda: bench.loop.blocks.recorded)
+    assert bench.told[:2] == [BlockPhase.ACCEPTED, BlockPhase.PLAYING] and bench.told[-1] is BlockPhase.ENDED
     assert bench.states[-1].sample == count and {state.stamp_ns for state in bench.states} == {7}
     for place, axis in enumerate(bench.simulator.axes):
         played = [each for each in bench.simulator.log if each.axis == axis]
@@ -104,7 +106,7 @@ def test_a_device_plays_a_block_by_its_clock_bit_for_bit(bench, count):
         np.testing.assert_array_equal([each.voltage for each in played], v[changed, place] * (1.0 / bench.kind.gain))
         times = np.array([each.time_ns for each in played])
         np.testing.assert_array_equal(times - times[0], (changed - changed[0]) * 50_000)
-    recording = bench.loop.recorded[0].recording
+    recording = bench.loop.blocks.recorded[0].recording
     np.testing.assert_allclose(recording.times, np.arange(count) * period, atol=1e-12)
     np.testing.assert_allclose(recording.voltages, v, atol=1e-8)
     # The positions are those of the simulated stage, and the states went on meanwhile.
@@ -125,11 +127,11 @@ def test_a_device_plays_a_block_by_its_clock_bit_for_bit(bench, count):
 def test_where_a_device_cannot_it_is_streamed(bench):
     v = wave(200, 2e-3, 20.0, 30.0)
     bench.submit(v, 2e-3)
-    bench.until(lambda: bench.loop.recorded)
-    assert bench.told[-1] is Told.ENDED and "streamed" in bench.states[0].reason
+    bench.until(lambda: bench.loop.blocks.recorded)
+    assert bench.told[-1] is BlockPhase.ENDED and "streamed" in bench.states[0].reason
     assert bench.largest_step <= SLEW * 2.0 / RATE
     np.testing.assert_allclose(bench.path()[-1], v[-1, 0], atol=1e-4)
-    recording = bench.loop.recorded[0].recording
+    recording = bench.loop.blocks.recorded[0].recording
     assert np.ptp(recording.positions[:, 1]) > 1e-7
 
 
@@ -151,15 +153,15 @@ def test_what_is_refused_moves_nothing(bench, voltages, names, named):
     bench.submit(voltages, 2e-3, names)
     bench.turn(3)
     (state,) = bench.states
-    assert state.told is Told.REFUSED and re.search(named, state.reason)
+    assert state.phase is BlockPhase.REFUSED and re.search(named, state.reason)
     assert bench.simulator.log == [] and not [each for each in bench.simulator.received if each.startswith("W")][1:]
 
 
 @pytest.mark.parametrize("bench", [("gcs", 2, [20.0, 30.0], False)], indirect=True)
 def test_times_that_do_not_increase(bench):
-    bench.loop.submit(BlockRequest(7, ("a0",), np.array([0, 0]), np.array([[20.0], [20.0]])))
+    bench.loop.blocks.submit(BlockRequest(7, ("a0",), np.array([0, 0]), np.array([[20.0], [20.0]])))
     bench.turn(2)
-    assert bench.told == [Told.REFUSED]
+    assert bench.told == [BlockPhase.REFUSED]
 
 
 @pytest.mark.parametrize(
@@ -175,12 +177,12 @@ def test_stopped_it_holds_where_it_is(bench, how):
     assert "block" in bench.loop.command([20.0, 30.0])
     bench.submit(v, period, stamp=8)
     bench.until(lambda: [state for state in bench.states if state.stamp_ns == 8])
-    assert [state.told for state in bench.states if state.stamp_ns == 8] == [Told.REFUSED]
+    assert [state.phase for state in bench.states if state.stamp_ns == 8] == [BlockPhase.REFUSED]
     if how == "stop":
         bench.loop.request("stop")
     else:
         bench.submit(np.zeros((0, 2)), period)
-    bench.until(lambda: bench.told[-1] is Told.STOPPED)
+    bench.until(lambda: bench.told[-1] is BlockPhase.STOPPED)
     sample, there = bench.states[-1].sample, bench.kind.volts(bench.simulator)
     assert 0 < sample < count
     # Streamed, it lags behind by a cycle.
@@ -206,7 +208,7 @@ def test_a_link_that_is_lost_ends_the_block_here(bench, kind):
     bench.until(lambda: bench.simulator.log)
     bench.simulator.fault = Fault(kind, seconds=0.0)
     bench.until(lambda: bench.loop.status.state is State.LOST, lost=True)
-    assert bench.told[-1] is Told.STOPPED and bench.states[-1].reason == bench.loop.status.reason
+    assert bench.told[-1] is BlockPhase.STOPPED and bench.states[-1].reason == bench.loop.status.reason
     # A device that plays on by itself is not taken over before its end.
     bench.until(lambda: bench.loop.status.state is State.HELD, most=10**7, lost=True)
     there = bench.kind.volts(bench.simulator)
@@ -227,7 +229,7 @@ def test_the_end_of_the_driver_stops_a_block_where_it_is(bench):
         time.sleep(1e-3)
     bench.loop.end()
     thread.join()
-    assert bench.told[-1] is Told.STOPPED and 0 < bench.states[-1].sample < len(v)
+    assert bench.told[-1] is BlockPhase.STOPPED and 0 < bench.states[-1].sample < len(v)
     there = bench.kind.volts(bench.simulator)
     assert there == pytest.approx(v[bench.states[-1].sample - 1].tolist(), abs=1e-9)
     bench.simulator.move()
@@ -250,4 +252,4 @@ def test_while_it_is_held_nothing_is_played(bench):
     bench.turn()
     bench.submit([[20.0], [20.0]], 2e-3)
     bench.turn()
-    assert bench.told == [Told.REFUSED] and "~/arm" in bench.states[-1].reason
+    assert bench.told == [BlockPhase.REFUSED] and "~/arm" in bench.states[-1].reason

@@ -9,7 +9,9 @@ import pytest
 from slpi_ros.drivers.base import Channel, DeviceError, LinkError, UnsuitableError
 from slpi_ros.drivers.registry import make_device
 from slpi_ros.model.limits import Limits
-from slpi_ros.nodes.device_loop import DeviceLoop, LoopSettings, State
+from slpi_ros.nodes.device_link import State
+from slpi_ros.nodes.device_loop import DeviceLoop
+from slpi_ros.nodes.device_writer import LoopSettings
 from slpi_ros.simulation.devices.base import FAULTS, LATE, SILENT, Fault
 from slpi_ros.simulation.devices.gcs import GcsSimulator
 
@@ -227,7 +229,7 @@ def test_somebody_else_moves_the_device():
         at.turn_until(lambda: at.loop.status.state is State.HELD)
         assert "45 V" in at.loop.status.reason and "30 V" in at.loop.status.reason
         assert at.simulator.log[-1].voltage == 45.0
-        assert at.answer("arm")[1] and at.loop._written == (45.0,)
+        assert at.answer("arm")[1] and at.loop._writer.written == (45.0,)
 
 
 def test_a_command_that_is_not_in_volts_is_found_by_the_first_moves():

@@ -8,7 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from strategies import fractions
 
-from slpi_ros.model.limits import PERIOD, Limits, RateLimiter
+from slpi_ros.effects.excitation import MEAN_SPEED
+from slpi_ros.model.limits import PERIOD, Limits, RateLimiter, StageLimiter
 
 MS = 1_000_000
 LIMITS = Limits(0.0, 100.0, 20.0)
@@ -160,3 +161,21 @@ def test_copies_go_their_own_ways():
     twin = limiter.copy()
     twin.step(50.0, 0)
     assert limiter.voltage == 10.0 and twin.voltage > 10.0
+
+
+def test_all_axes_of_a_stage_keep_their_own_limits():
+    stage = StageLimiter([LIMITS, Limits(-10.0, 10.0)], PERIOD)
+    stage.start([50.0, 5.0])
+    assert stage.voltages == (50.0, 5.0) and stage.within(stage.voltages, (50.0, 5.0), 0.0)
+    assert stage.step((90.0, 20.0), 10**12) == (pytest.approx(50.0 + 20.0 * 2 * PERIOD), 10.0)
+    assert stage.within((51.0, 9.8), (50.0, 10.0), 0.01) and not stage.within((51.1, 10.0), (50.0, 10.0), 0.01)
+    with pytest.raises(ValueError, match="zip"):
+        stage.step((1.0,), 10**12)
+
+
+def test_gently_an_axis_without_a_slew_limit_moves_at_a_moderate_rate():
+    assert LIMITS.gentle == 20.0 and Limits(-10.0, 10.0).gentle == pytest.approx(20.0 * MEAN_SPEED)
+    stage = StageLimiter([LIMITS, Limits(-10.0, 10.0)], PERIOD)
+    stage.start([50.0, 5.0])
+    slow, moderate = stage.step((0.0, -10.0), 10**12, gently=True)
+    assert slow == pytest.approx(50.0 - 20.0 * 2 * PERIOD) and moderate == pytest.approx(5.0 - 16.0 * 2 * PERIOD)

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from benchmarks.sensor_lies import DRIVERS, LIES, MARK, SENSORS, live, stage_of
-from slpi_ros.calibration.drive_watch import DriveWatch, _surest_slope
+from slpi_ros.calibration.drive_monitor import DriveMonitor
+from slpi_ros.calibration.drive_rules import RelationLimits, surest_slope
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import Limits
 
@@ -14,6 +15,7 @@ from slpi_ros.model.limits import Limits
 QUICK = {"exciter": ("usual", "40 ms late"), "calibrator": ("noise 3 % of the stroke",)}
 # Lies of each kind to the exciter, and one to the calibrator, whose watch is the same; the others are long.
 FIRST = {"exciter": ("frozen", "effort 0", "stale stamps", "sign flipped"), "calibrator": ("frozen",)}
+FOLLOWING = RelationLimits().frozen
 # What names each lie in the message.
 NAMES = {
     "stale stamps": "stamps", "effort 0": "effort", "effort stays": "effort", "silent": "no valid stage_state",
@@ -58,7 +60,7 @@ def test_an_honest_sensor_is_let_alone(driver, sensor, seed, drive):
 
 
 def watch_of(**given):
-    watch = DriveWatch(["x"], [Limits(0.0, 100.0)], 0.5, **given)
+    watch = DriveMonitor(["x"], [Limits(0.0, 100.0)], 0.5, **given)
     watch.begin([20.0], 0)
     return watch
 
@@ -101,13 +103,13 @@ def test_stamps_that_jump_are_named_with_value_and_limit():
 
 
 def test_the_start_is_the_median_of_three_recent_reports_or_the_latest_of_a_slow_driver():
-    watch = DriveWatch(["x"], [Limits(0.0, 100.0)], 0.5)
+    watch = DriveMonitor(["x"], [Limits(0.0, 100.0)], 0.5)
     for number, v in enumerate([40.0, 0.0, 40.1]):
         at = number * 20_000_000
         assert watch.started_from(at, 0) is None
         watch.state(SECOND_NS, SECOND_NS, [v], [1e-6], at)
     assert watch.started_from(40_000_000, 0) == [40.0]
-    slow = DriveWatch(["x"], [Limits(0.0, 100.0)], 0.5)
+    slow = DriveMonitor(["x"], [Limits(0.0, 100.0)], 0.5)
     slow.state(SECOND_NS, SECOND_NS, [30.0], [1e-6], 0)
     for number in range(60):
         slow.check(number * 20_000_000)
@@ -117,6 +119,6 @@ def test_the_start_is_the_median_of_three_recent_reports_or_the_latest_of_a_slow
 def test_the_slope_at_the_beginning_of_a_motion_is_the_true_one():
     """Of displacements that are taken to be later, the slope would be 20 times too large."""
     v = np.concatenate([np.zeros(60), np.linspace(0.0, 50.0, 30) ** 2 / 50.0])
-    slope, error, sign = _surest_slope(v, -1e-7 * v)
+    slope, error, sign = surest_slope(v, -1e-7 * v, FOLLOWING)
     assert slope == pytest.approx(1e-7) and sign == -1.0 and error < 1e-3 * slope
-    assert _surest_slope(v, np.zeros(v.size))[0] == 0.0
+    assert surest_slope(v, np.zeros(v.size), FOLLOWING)[0] == 0.0

@@ -8,7 +8,8 @@ from strategies import FAMILY_CASE, axis_model
 
 from slpi_ros.compensator.controller import Controller
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
-from slpi_ros.compensator.sensor_watch import SensorWatch
+from slpi_ros.compensator.motion import Safety
+from slpi_ros.compensator.sensor_rule import SensorRule
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
 
@@ -19,7 +20,8 @@ FAULT_TIME = 0.5
 
 def watched(model, reading, seconds, period=0.002):
     """Return the fault and its time (s) after 1 s of good readings; `reading` takes times and true places (m)."""
-    watch, rng = SensorWatch(SPAN, NOISE), np.random.default_rng(1)
+    watch, rng = SensorRule(SPAN, NOISE), np.random.default_rng(1)
+    watch.fault_time = FAULT_TIME
     watch.begin(0)
     t = np.arange(0.0, 1.0 + seconds, period)
     true = model(t)
@@ -28,7 +30,7 @@ def watched(model, reading, seconds, period=0.002):
         now_ns = round(now * 1e9)
         if not np.isnan(y):
             watch.read(expected, y, now_ns)
-        fault = watch.judge(now_ns, FAULT_TIME)
+        fault = watch.check(now_ns)
         if fault:
             assert "\n" not in fault.reason
             return fault.kind, now - 1.0
@@ -103,7 +105,8 @@ class Loop:
                 self.made.measure(["x"], [told], self.now_ns)
             self.made.update(self.now_ns, ["x"], [8e-6 - 3e-6 * np.cos(3.0 * t)], self.now_ns)
             self.stage.forward(self.made.voltages[0] + self.offset)
-            self.faults += [(fault.kind, t)] if (fault := self.axis.loop.faulty(FAULT_TIME, self.now_ns)) else []
+            found = self.made.watch(Safety(0.0, False, False, (0.0,), 50.0), FAULT_TIME, self.now_ns)
+            self.faults += [(each.kind, t) for each in found if each.rule == "sensor"]
 
 
 @pytest.mark.parametrize(("kind", "sensor"), [

@@ -1,0 +1,126 @@
+"""Readings of a sensor against the displacements that were expected: silent, stuck, inverted or noisy."""
+
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+from math import inf
+
+import numpy as np
+
+from slpi_ros.arrays import FloatArray
+from slpi_ros.compensator.monitor import Finding, Lasting, Rule, Silence
+from slpi_ros.io.messages import SECOND_NS
+
+# Fewest readings for a judgement, and for a slope with a delay; most readings that are kept.
+FEWEST, FEWEST_SHIFTED, KEPT = 8, 4, 4096
+# Standard deviation of a second difference, in those of the single values.
+BEND = 6.0**0.5
+
+
+@dataclass(frozen=True)
+class FollowingLimits:
+    """When readings do not follow what is expected: the slope of readings over expected displacements.
+
+    As the sensor may be late, the largest slope over `shifts` delays of up to the share `late` of the readings counts.
+    """
+
+    stuck: float = 0.1  # below this slope,
+    error: float = inf  # if its standard error is smaller than this
+    inverted: float = -0.2  # below this slope,
+    errors: float = 0.0  # and this many standard errors below zero
+    late: float = 0.1
+    shifts: int = 16
+
+
+@dataclass(frozen=True)
+class SensorLimits:
+    """When a sensor is faulty; shares of the displacement range."""
+
+    # The expected displacement has to move by this share, and by this many times the noise of the sensor.
+    moved: float = 0.02
+    moved_noises: float = 8.0
+    noisy: float = 0.03  # scatter from sample to sample, rms
+    lasts: float = 0.5  # share of the time looked at for which a fault has to last: the readings span as much already
+    following: FollowingLimits = FollowingLimits()
+
+
+def slopes(expected: FloatArray, reading: FloatArray, limits: FollowingLimits) -> Iterator[tuple[float, float]]:
+    """Yield slope and standard error of readings over what is expected, shape (N,) each, for each delay of them."""
+    latest = int(limits.late * expected.size)
+    for shift in sorted({round(share * latest) for share in np.linspace(0.0, 1.0, limits.shifts)}):
+        early, late = expected[: expected.size - shift], reading[shift:]
+        centred = early - early.mean()
+        power = float(centred @ centred)
+        if early.size < FEWEST_SHIFTED or power <= 0.0:
+            continue
+        rest = late - late.mean()
+        slope = float(centred @ rest) / power
+        left = rest - slope * centred
+        yield slope, float(np.sqrt(left @ left / max(early.size - 2, 1) / power))
+
+
+def misfit(expected: FloatArray, reading: FloatArray, limits: FollowingLimits) -> tuple[str, float]:
+    """Return "inverted", "stuck" or "" of readings, shape (N,) each, and the slope that says so."""
+    slope, error = max(slopes(expected, reading, limits), default=(1.0, inf))
+    if slope < limits.inverted and slope < -limits.errors * error:
+        return "inverted", slope
+    return ("stuck" if slope < limits.stuck and error <= limits.error else ""), slope
+
+
+class SensorRule(Rule):
+    """A sensor follows the displacements of the model for the output voltages; m, steady clock in ns.
+
+    `fault_time` (s; 0: not judged) is the time without a reading, and the time looked at, in which a fault has to show.
+    `span` is the displacement range, `noise` that of the sensor.
+    """
+
+    def __init__(self, span: float, noise: float = 0.0, limits: SensorLimits | None = None, axis: str = "") -> None:
+        self.span, self.noise, self.axis = span, noise, axis
+        self.fault_time = 0.0
+        self._limits = limits or SensorLimits()
+        self._readings: deque[tuple[int, float, float]] = deque(maxlen=KEPT)  # ns, expected (m), reading (m)
+        self._silence: Silence | None = None  # None: not begun
+        self._suspect = Lasting()
+
+    def begin(self, now_ns: int) -> None:
+        """Start to watch at `now_ns`; what was read before does not count."""
+        self._readings.clear()
+        self._suspect.forget()
+        self._silence = Silence(now_ns, lambda seconds: f"no measured_displacement for {seconds:.2g} s")
+
+    def read(self, expected: float, reading: float, now_ns: int) -> None:
+        """Take a reading (m), and the displacement of the model (m) at that time."""
+        if self._silence:
+            self._silence.hear(now_ns)
+        self._readings.append((now_ns, expected, reading))
+
+    def check(self, now_ns: int) -> Finding | None:
+        """Return the fault that has lasted for the fault time at `now_ns`; None without one."""
+        if self._silence is None or not self.fault_time:
+            return None
+        if reason := self._silence.beyond(self.fault_time, now_ns):
+            return Finding("sensor", "silent", reason, self.axis)
+        kind, reason = self._look(now_ns)
+        lasts = self._suspect.note(kind, now_ns, int(self._limits.lasts * self.fault_time * SECOND_NS))
+        return Finding("sensor", kind, reason, self.axis) if lasts else None
+
+    def _look(self, now_ns: int) -> tuple[str, str]:
+        """Return the kind and the reason of the fault that the readings of the last fault time show; "" if none."""
+        oldest_ns = now_ns - int(self.fault_time * SECOND_NS)
+        while self._readings and self._readings[0][0] < oldest_ns:
+            self._readings.popleft()
+        if len(self._readings) < FEWEST:
+            return "", ""
+        _, expected, reading = np.array(self._readings, dtype=float).T
+        limits, model = self._limits, float(np.ptp(expected))
+        # Second differences remove what moves evenly.
+        scatter, smooth = (float(np.std(np.diff(each, 2))) / BEND for each in (reading, expected))
+        if scatter > limits.noisy * self.span + 2.0 * smooth:
+            return "noisy", f"the reading scatters by {scatter * 1e9:.4g} nm rms"
+        if model < max(limits.moved * self.span, limits.moved_noises * self.noise):
+            return "", ""
+        kind, slope = misfit(expected, reading, limits.following)
+        if kind == "inverted":
+            return kind, f"the reading moves by {slope:.2g} m for each metre that the voltage moves; check its sign"
+        moved = f"{np.ptp(reading) * 1e9:.3g} nm while the voltage moves it by {model * 1e9:.4g} nm"
+        return kind, f"the reading stays within {moved}"

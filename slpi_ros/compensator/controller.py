@@ -53,11 +53,11 @@ class OperatingMode(Enum):
     STREAMING = "streaming"
     # Points of a trajectory are pending.
     TRAJECTORY = "trajectory"
-    # An axis ramps to a voltage, or to rest; a desired displacement ends that.
+    # An axis ramps to a voltage, or to rest.
     RAMPING = "ramping"
-    # A device plays a block by itself; only its end, or deactivation, ends it.
+    # A device plays a block by itself.
     BLOCK = "block"
-    # The memory is being reset; only deactivation interrupts the reset.
+    # The memory of an axis is being reset.
     RESETTING = "resetting"
 
 
@@ -75,8 +75,9 @@ class Controller:
     """Inverse hysteresis compensation, with optional feedback, for all axes of a stage; sequences in their order.
 
     Every axis has one motion at a time (`slpi_ros.compensator.motion`). `update` checks a desired message as a whole
-    and moves every axis named in it; `advance` does what is due without a message. `stop` is the one way to end a
-    motion from outside. The first voltage starts from where the amplifiers are (`locate`), and their reports are held
+    and moves every axis named in it; `advance` does what is due without a message. A motion that is asked for either
+    replaces the present ones, as the table allows, or is rejected; `stop` is the one way to end them without another
+    one. The first voltage starts from where the amplifiers are (`locate`), and their reports are held
     against what was output (`report`). A loaded model cannot relax the limits; one with another `hardware_id` is
     refused, "" accepts any. Without `loops`, feedback is disabled.
     """
@@ -314,10 +315,14 @@ class Controller:
             raise RejectedError(rejection.INACTIVE, "the compensator is not active; activate it")
         if self.model is None:
             raise RejectedError(rejection.NO_MODEL, "there is no model yet; give model_file, or publish stage_model")
+        # All axes are asked: a reset, a block or a trajectory belongs to the whole stage.
         for present in [axis.motion.kind for axis in self.axes] + [Kind.TRAJECTORY] * self.trajectory.on:
-            if kind not in REPLACED_BY[present] and present in REFUSALS:
-                cause, advice = REFUSALS[present]
-                raise RejectedError(cause, f"{self.activity(now_ns)}; {advice}")
+            if kind in REPLACED_BY[present]:
+                continue
+            if present is Kind.FAULT and self.ownership.obstacle:
+                raise RejectedError(*self.ownership.obstacle)
+            cause, advice = REFUSALS[present]
+            raise RejectedError(cause, f"{self.activity(now_ns)}; {advice}")
 
     # Desired and measured displacements
 

@@ -99,7 +99,7 @@ class Ownership:
     def lost(self, now_ns: int) -> bool:
         """Return whether somebody else has begun to move an axis; nothing may then be output until `arm`."""
         self.monitor.check(now_ns)
-        if not (self.monitor.standing and self.armed):
+        if not (self.started and self.monitor.standing and self.armed):
             return False
         self.obstacle = NOT_ARMED, str(self.monitor.standing[0])
         return True

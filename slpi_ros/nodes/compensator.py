@@ -97,6 +97,7 @@ class Compensator(LifecycleNode):
         self._state_subscription = self.create_subscription(
             JointState, "stage_state", self._on_state, MEASUREMENTS, raw=True
         )
+        self._mode = controller.mode  # as told last
         self._begun_ns, self._reported_ns, self._looked_ns = time.monotonic_ns(), 0, 0
         # A simulated clock may stop while the amplifier moves in real time.
         steady_timer(self, values["diagnostic_period"], self._on_period)
@@ -229,8 +230,7 @@ class Compensator(LifecycleNode):
             controller.stop(StopReason.DEACTIVATED, now_ns)
         if safety.ramps_on_deactivate and controller.ownership.owned:
             controller.ramp(safety.voltages, safety.rate, now_ns)
-        if before is OperatingMode.RESETTING:
-            self._memory.answer_reset()
+        self._note_mode()
         while controller.ramping and controller.ownership.owned and self.context.ok():
             time.sleep(self._settings.period)
             now_ns = time.monotonic_ns()
@@ -312,14 +312,12 @@ class Compensator(LifecycleNode):
         controller, now_ns = self._controller, time.monotonic_ns()
         if controller.ownership.started and now_ns - self._reported_ns < REPORT_NS:
             return
-        self._reported_ns, before = now_ns, controller.mode
+        self._reported_ns = now_ns
         try:
             state = deserialize_message(data, JointState)
         except RuntimeError:
             return
         if controller.report(state.name, state.effort, now_ns):
-            if before is OperatingMode.RESETTING:
-                self._memory.answer_reset()
             self._reporter.report()
 
     def _locate(self) -> None:
@@ -371,6 +369,7 @@ class Compensator(LifecycleNode):
         """Execute what is due of the motion without messages, if anything."""
         controller, reporter = self._controller, self._reporter
         if controller.next_due_ns(0, 0) is None:
+            self._note_mode()
             return
         now_ns, clock_ns = self._paths.clocks()
         before = controller.mode
@@ -386,10 +385,16 @@ class Compensator(LifecycleNode):
                 reporter.lateness.note(deadline_ns, clock_ns)
             if (counts["points_held_at_limit"], counts["excursions"]) != held:
                 self._report_held()
-        if controller.mode is not before:
+        self._note_mode()
+
+    def _note_mode(self) -> None:
+        """Tell that the mode has changed; a reset that has ended, in whatever way, is answered."""
+        mode, before = self._controller.mode, self._mode
+        if mode is not before:
+            self._mode = mode
             if before is OperatingMode.RESETTING:
                 self._memory.answer_reset()
-            reporter.report()
+            self._reporter.report()
 
     def _on_period(self) -> None:
         configured = self._controller.mode is not OperatingMode.UNCONFIGURED

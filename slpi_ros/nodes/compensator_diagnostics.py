@@ -308,6 +308,7 @@ def _microseconds(report: TimingReport | None) -> tuple[str, str, str]:
 def _axis_values(axis: Axis, created: str) -> dict[str, object]:
     drift, quality = axis.loop.drift, axis.model.quality if axis.model else None
     values = {
+        "motion": axis.motion.kind.value,
         "voltage_V": f"{axis.voltage:.4f}",
         "memory": axis.confidence.state,
         "memory_doubt": axis.confidence.doubt,

@@ -40,12 +40,12 @@ class DriftedStage:
 
     def follow(self, wishes: list[float]) -> np.ndarray:
         """Return the errors (m) of a path in real time, each sample measured before the next is sent."""
-        errors, begun = [], time.monotonic()
-        for k, y in enumerate(wishes):
+        errors = []
+        for y in wishes:
             self._client.ask(["x"], [y], START_NS + self._sent * PERIOD_NS)
             self._sent += 1
             # The loop goes by the clock of the node, between the samples as well.
-            end = begun + (k + 1) * PERIOD_NS * 1e-9
+            end = time.monotonic() + PERIOD_NS * 1e-9
             self._client.graph.spin_until(lambda end=end: time.monotonic() >= end, "the next sample")
             voltages = self._client.answers
             for (voltage,) in voltages[self._followed :]:

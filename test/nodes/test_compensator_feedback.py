@@ -18,7 +18,7 @@ from slpi_ros.compensator.feedback import Drift  # noqa: E402
 from slpi_ros.model.document import save_model  # noqa: E402
 from slpi_ros.nodes.compensator_diagnostics import remedy  # noqa: E402
 
-GAINS = {"kp": 2e6, "ki": 1e9}
+GAINS = {"kp": 5e5, "ki": 3e8}
 
 
 @pytest.fixture

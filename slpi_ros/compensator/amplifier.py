@@ -137,13 +137,8 @@ class Amplifier(Rule):
         noise = self.limits.noises * median(bends) / NORMAL_BEND if bends else 0.0
         return min(noise, self.limits.share * self.span)
 
-    @property
-    def tolerance(self) -> float:
-        """Largest difference (V) between a report and an output voltage that means nothing."""
-        return self._tolerance()
-
-    def _tolerance(self, gain: float = 1.0) -> float:
-        """Return the tolerance (V) of voltages that are reports divided by a gain."""
+    def tolerance(self, gain: float = 1.0) -> float:
+        """Return the largest difference (V) that means nothing, of an output voltage from a report divided by `gain`."""
         return max(self.limits.share * self.span, self._noise / gain) + self.slack
 
     @property
@@ -169,7 +164,7 @@ class Amplifier(Rule):
         if before is not None and high == low:
             self._differences.append(abs(voltage - before))
         self._pairs.append((now_ns, self._last, voltage))
-        there, tolerance = self.calibration.voltage(voltage), self._tolerance(self.calibration.gain)
+        there, tolerance = self.calibration.voltage(voltage), self.tolerance(self.calibration.gain)
         outside = "" if low - tolerance <= there <= high + tolerance else "outside"
         if self._outside.note(outside, now_ns, self.limits.lasts_ns):
             self._judge(low, high, voltage)
@@ -210,7 +205,7 @@ class Amplifier(Rule):
         levels = self._levels.since(now_ns - for_ns + PIECE_NS - 1)
         oldest_ns = min([last[0][0], *(number * PIECE_NS for number, _, _ in levels)])
         values = [v for _, v in last] + [v for _, low, high in levels for v in (low, high)]
-        if now_ns - oldest_ns < for_ns * 0.9 or max(values) - min(values) > 2.0 * self.tolerance:
+        if now_ns - oldest_ns < for_ns * 0.9 or max(values) - min(values) > 2.0 * self.tolerance():
             return None
         recent = [v for t, v in self._reports if now_ns - t <= for_ns]
         return self.calibration.voltage(median(recent or [v for _, v in last]))
@@ -265,14 +260,14 @@ class Amplifier(Rule):
             low, high, r = ends.min(axis=0), ends.max(axis=0), reported[used]
             middle = ends[1]
             power = float(middle @ middle)
-            moved = np.abs(middle - middle[-1]) > self.tolerance
+            moved = np.abs(middle - middle[-1]) > self.tolerance()
             for found in (
                 Calibration(1.0, float(np.median(r - middle))),
                 Calibration(float(middle @ r) / power if power > 0.0 else 0.0),
             ):
                 if not GAINS[0] <= found.gain <= GAINS[1]:
                     continue
-                v, tolerance = (r - found.offset) / found.gain, self._tolerance(found.gain)
+                v, tolerance = (r - found.offset) / found.gain, self.tolerance(found.gain)
                 near = (low - tolerance <= v) & (v <= high + tolerance)
                 share = float(near.mean())
                 if share < EXPLAINED or (moved.any() and float(near[moved].mean()) < EXPLAINED_MOVING):
@@ -286,7 +281,7 @@ class Amplifier(Rule):
         """Return whether reports `r` (V), voltages `v` by a gain, have followed a motion of the outputs `middle`."""
         span, moved = float(np.ptp(middle)), float(np.ptp(r))
         # Noise divided by a small gain is no motion.
-        if min(span, moved / gain) < MOVED * self.tolerance or moved < MOVED * self._noise:
+        if min(span, moved / gain) < MOVED * self.tolerance() or moved < MOVED * self._noise:
             return False
         # At the voltages between, too: a jump of somebody else beside a move of this node is no gain.
         between = np.abs(middle - 0.5 * (middle.min() + middle.max())) < (0.5 - BETWEEN) * span

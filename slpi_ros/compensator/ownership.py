@@ -75,15 +75,16 @@ class Ownership:
             )
         if self._ever:
             return axis.voltage, ""
-        if self.reporting:
-            return axis.voltage, (
-                f"stage_state holds no usable voltage of this axis (effort); it is taken to be at {axis.voltage:.4g} "
-                "V: check the driver before you send anything, or set start_voltage"
-            )
-        return axis.voltage, (
-            f"nobody reports the voltage of the amplifier (effort of stage_state); it is taken to be at "
-            f"{volts(axis.voltage)} V: check that before you send anything, or set start_voltage"
+        why, at, checked = (
+            "nobody reports the voltage of the amplifier (effort of stage_state)",
+            volts(axis.voltage),
+            "that",
         )
+        if self.reporting:
+            why, at = "stage_state holds no usable voltage of this axis (effort)", f"{axis.voltage:.4g}"
+            checked = "the driver"
+        taken = f"it is taken to be at {at} V: check {checked} before you send anything, or set start_voltage"
+        return axis.voltage, f"{why}; {taken}"
 
     def begin_output(self, now_ns: int) -> None:
         """Find the voltages at the start once more, and take them to be those of the amplifiers, or reject."""

@@ -29,7 +29,7 @@ class Memory:
 
     def __init__(self, node: Node, controller: Controller, path: str, reporter: Reporter) -> None:
         self._node, self._controller, self._reporter = node, controller, reporter
-        self._file, self._kept = MemoryFile(path), path != ""
+        self._file = MemoryFile(path) if path else None
         self.waits = False  # for the voltages at the start, before it begins
         self._service = DeferredService(node, "~/reset_memory", self._on_reset)
         serve(node, "~/set_zero", self._on_set_zero)
@@ -38,7 +38,7 @@ class Memory:
 
     def find(self, model: StageModel) -> tuple[Mapping[str, SavedAxis] | None, Mapping[str, float] | None]:
         """Return what was saved with a model before the first one, and if it was another one, its last voltages (V)."""
-        if self._controller.axes[0].model:
+        if self._file is None or self._controller.axes[0].model:
             return None, None
         try:
             return self._file.find(model, self._controller.names), None
@@ -48,7 +48,7 @@ class Memory:
 
     def note(self, voltages: bytes) -> None:
         """Store voltages (V, native doubles) that are about to be published."""
-        if self._kept:
+        if self._file:
             try:
                 self._file.note(voltages)
             except ModelError as error:
@@ -56,12 +56,13 @@ class Memory:
 
     def save(self, *, complete: bool) -> None:
         """Save the memory, or log the error; `complete` means that no further voltage is output afterwards."""
-        if not self._kept or self._controller.model is None:
+        model = self._controller.identified
+        if self._file is None or model is None:
             return
         now_ns = time.monotonic_ns()
         try:
             axes = {axis.name: axis.saved(now_ns) for axis in self._controller.axes}
-            self._file.save(self._controller.identified, axes, complete)
+            self._file.save(model, axes, complete)
         except SlpiError as error:
             self._tell(error)
 

@@ -132,13 +132,12 @@ class Amplifier(Rule):
             return self.limits.noises * median(self._differences) / NORMAL_DIFFERENCE
         # Of steady voltages there are too few yet: second differences of the last reports, which even motion is not in.
         # Uneven motion is, which must not pass for noise.
-        last = [v for _, v in self._reports][-DIFFERENCES:]
-        bends = [abs(c - 2.0 * b + a) for a, b, c in zip(last, last[1:], last[2:], strict=False)]
-        noise = self.limits.noises * median(bends) / NORMAL_BEND if bends else 0.0
+        bends = np.abs(np.diff([v for _, v in self._reports][-DIFFERENCES:], 2))
+        noise = self.limits.noises * float(np.median(bends)) / NORMAL_BEND if bends.size else 0.0
         return min(noise, self.limits.share * self.span)
 
     def tolerance(self, gain: float = 1.0) -> float:
-        """Return the largest difference (V) that means nothing, of an output voltage from a report divided by `gain`."""
+        """Return the largest difference (V) of an output voltage from a report, over its gain, that means nothing."""
         return max(self.limits.share * self.span, self._noise / gain) + self.slack
 
     @property

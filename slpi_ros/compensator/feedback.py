@@ -28,6 +28,10 @@ class PidGains:
             if not (isfinite(value) and value >= 0.0):
                 raise UsageError(f"PID gain {field.name} is {value}; give a finite value that is not negative")
 
+    def direct(self, error: float, rate: float) -> float:
+        """Return the part of the correction (V) that an error (m) and a measured rate (m/s) make at once."""
+        return self.proportional * error - self.derivative * rate
+
 
 class Feedback:
     """Feedforward plus PID of one axis: ``v = correct(now_ns, desired, measured, feedforward)``; initially disabled.
@@ -68,14 +72,11 @@ class Feedback:
         """Whether the correction is at its limit."""
         return abs(self.correction) >= self.correction_limit
 
-    def enable(self) -> None:
-        """Enable the PID without a voltage step at the next measurement; no effect if it is enabled already."""
-        if not self.enabled:
-            self.enabled = self._taking_over = True
-
-    def disable(self) -> None:
-        """Disable the PID; the correction decays with `release_time`."""
-        self.enabled = False
+    def switch(self, on: bool) -> None:
+        """Enable the PID without a voltage step at the next measurement, or let the correction decay; if it is not."""
+        if on and not self.enabled:
+            self._taking_over = True
+        self.enabled = on
 
     def forget(self) -> None:
         """Discard the last measurement; the PID restarts without a voltage step at the next one."""
@@ -85,8 +86,8 @@ class Feedback:
 
     def retune(self, gains: PidGains) -> None:
         """Replace the gains without a voltage step, or raise and keep them if they give no finite voltage."""
-        before, after = (self._direct(each, self._error, self._rate) for each in (self.gains, gains))
-        offset = self._offset + (before - after)
+        error, rate = self._error, self._rate
+        offset = self._offset + (self.gains.direct(error, rate) - gains.direct(error, rate))
         if not isfinite(offset):
             raise UsageError(f"{gains} give no finite voltage; check their units")
         self.gains, self._offset = gains, offset
@@ -96,7 +97,7 @@ class Feedback:
         self._require_order(now_ns)
         elapsed = (now_ns - self._measured_ns) * 1e-9
         error, rate = desired - measured, self._next_rate(elapsed, measured)
-        direct = self._direct(self.gains, error, rate)
+        direct = self.gains.direct(error, rate)
         if not isfinite(direct):
             raise UsageError(f"desired {desired} m, measured {measured} m gives no finite voltage; hold the sample")
         if self.enabled:
@@ -172,10 +173,6 @@ class Feedback:
         wanted = feedforward + direct + offset + self._integral
         step = self.gains.integral * error * dt
         return self._integral + part_within(step, reach[0] - wanted, reach[1] - wanted), offset
-
-    @staticmethod
-    def _direct(gains: PidGains, error: float, rate: float) -> float:
-        return gains.proportional * error - gains.derivative * rate
 
     def _output(self, feedforward: float, correction: float, now_ns: int) -> float:
         """Move to `feedforward` + `correction` (V) as far as all limits allow; return the voltage (V)."""

@@ -119,10 +119,7 @@ class Loop:
             # The last measurement gives no finite voltage with the new gains.
             feedback.forget()
             feedback.retune(settings.gains)
-        if settings.enabled:
-            feedback.enable()
-        else:
-            feedback.disable()
+        feedback.switch(settings.enabled)
 
     def close(self, stream: StreamingInverse, now_ns: int) -> None:
         """Start to follow the total voltage, at present that of the inverse `stream` of the axis."""
@@ -140,8 +137,7 @@ class Loop:
         self.closed, self.active = True, settings.enabled
         self.driven_ns = self.due_ns = now_ns
         self._between = 0.0
-        if settings.enabled and not self.fault:
-            self._feedback.enable()
+        self._feedback.switch(settings.enabled and not self.fault)
 
     def leave(self, stream: StreamingInverse) -> None:
         """Let the inverse of the axis go on from the total voltage."""
@@ -189,7 +185,7 @@ class Loop:
     def switch_off(self, fault: Finding) -> None:
         """Switch the feedback off because of a fault of its sensor."""
         self.fault = fault
-        self._feedback.disable()
+        self._feedback.switch(False)
 
     def forget_offsets(self) -> None:
         """Forget the offsets: the zero has moved."""

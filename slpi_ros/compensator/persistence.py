@@ -232,22 +232,12 @@ def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
 
 
 class MemoryFile:
-    """Save and restore the memory of a stage, with the voltages since the last save."""
+    """Save the memory of a stage whenever it has changed, with the voltages since the last save."""
 
     def __init__(self, path: str) -> None:
-        self._path = path
-        self.last_voltages: dict[str, float] = {}  # V by axis, as found, also if nothing else was usable
-        self._saved: SavedMemory | None = None
+        self.path = path
+        self._saved: SavedMemory | None = None  # by this process
         self._last: LastVoltages | None = None
-
-    def find(self, model: StageModel, names: Sequence[str]) -> Mapping[str, SavedAxis] | None:
-        """Return the saved state of each axis, None without file; ModelError if it is not of `model` and `names`."""
-        saved = load_memory(self._path)
-        if saved is None:
-            return None
-        self.last_voltages = saved.last_voltages
-        saved.require_fit(model, names)
-        return saved.axes
 
     def save(self, model: StageModel, axes: Mapping[str, SavedAxis], complete: bool) -> None:
         """Write the state of `axes` if it has changed; `complete`: no further voltage is output afterwards."""
@@ -255,13 +245,13 @@ class MemoryFile:
         if memory == self._saved:
             return
         if self._saved is None:
-            _require_no_other(self._path)
+            _require_no_other(self.path)
         try:
-            mark = save_memory(memory, self._path)
+            mark = save_memory(memory, self.path)
         except ModelError:
             if not complete and (self._saved is None or self._saved.complete):
                 # The complete state in the file is no longer the present one, but a crash would make it look so.
-                remove_file(self._path)
+                remove_file(self.path)
             raise
         self._saved = memory
         if self._last and complete:
@@ -270,7 +260,7 @@ class MemoryFile:
         elif self._last:
             self._last.mark = mark
         elif not complete:
-            self._last = LastVoltages(self._path, mark)
+            self._last = LastVoltages(self.path, mark)
 
     def note(self, voltages: bytes) -> None:
         """Store the voltages just output (V, native doubles), for recovery after a crash; called for each command."""

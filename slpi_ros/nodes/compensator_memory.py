@@ -8,7 +8,7 @@ from rclpy.node import Node
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.motion import reset_limits
-from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESTORED, MemoryFile, SavedAxis
+from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESTORED, MemoryFile, SavedAxis, load_memory
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import ModelError, SlpiError
 from slpi_ros.model.limits import volts
@@ -40,11 +40,15 @@ class Memory:
         """Return what was saved with a model before the first one, and if it was another one, its last voltages (V)."""
         if self._file is None or self._controller.axes[0].model:
             return None, None
+        saved = None
         try:
-            return self._file.find(model, self._controller.names), None
+            saved = load_memory(self._file.path)
+            if saved:
+                saved.require_fit(model, self._controller.names)
         except SlpiError as error:
             self._node.get_logger().warning(str(error))
-            return None, self._file.last_voltages
+            return None, saved.last_voltages if saved else None
+        return saved.axes if saved else None, None
 
     def note(self, voltages: bytes) -> None:
         """Store voltages (V, native doubles) that are about to be published."""

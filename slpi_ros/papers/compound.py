@@ -165,8 +165,7 @@ def follow(
     displacement, readings = axis.run(np.arange(v.size) / RATE, v)
     zero, y = float(readings[-1]), float(displacement[-1])
     control = Feedback(gains or PidGains(0.0), RateLimiter(LIMITS))
-    if gains:
-        control.enable()
+    control.switch(gains is not None)
     reading, done, read = 0.0, np.empty_like(desired), np.empty_like(desired)
     ahead = np.append(feedforward[1:], feedforward[-1])
     for k, (target, v_ahead) in enumerate(zip(desired.tolist(), ahead.tolist(), strict=True)):

@@ -41,7 +41,7 @@ def at(answer: Callable[..., float], t: float, *sample: float) -> float:
 
 def enabled(gains: PidGains = PID, limits: Limits = FREE, voltage: float = 0.0, **times: float) -> Feedback:
     feedback = made(gains, limits, voltage, **times)
-    feedback.enable()
+    feedback.switch(True)
     return feedback
 
 
@@ -85,7 +85,7 @@ def act(feedback: Feedback, action: str, sample: tuple[float, float, float, floa
     elif action == "limits":
         feedback.pace.limits = replace(feedback.pace.limits, lower=feedforward - 20.0, upper=feedforward + 60.0)
     else:
-        getattr(feedback, action)()
+        feedback.switch(action == "enable")
 
 
 def play(feedback: Feedback, script: list[tuple[str, tuple[float, float, float, float], PidGains]]) -> float:
@@ -166,7 +166,7 @@ def test_a_wrong_gain_leaves_no_error(wrong):
         stream = StreamingInverse(FAMILY_CASE.memory(), (2e-6, 14e-6), STAGE)
         stage, feedback = FAMILY_CASE.memory(), made(PI, STAGE, release_time=0.1)
         if active:
-            feedback.enable()
+            feedback.switch(True)
         for i in range(1000):
             t = 0.005 * i
             measured = 2e-6 + wrong * (stage.displacement - 2e-6)
@@ -323,10 +323,10 @@ def test_while_enabled_feedback_waits_for_a_measurement_only_the_feedforward_mov
     feedback = made(PID, FREE, release_time=0.5)
     script = [each for each in script if each[0] != "limits"]
     t = play(feedback, script) + first[0]
-    feedback.disable()
+    feedback.switch(False)
     at(feedback.correct, t, *first[1:])
     correction = feedback.correction
-    feedback.enable()
+    feedback.switch(True)
     for dt, *_, feedforward in later:
         t += dt
         assert at(feedback.hold, t, feedforward) == feedforward + correction
@@ -339,7 +339,7 @@ def test_the_error_at_the_moment_of_enabling_comes_in_softly():
     feedback = made(PI, FREE, release_time=release_time, longest_gap=0.5)
     assert not feedback.enabled
     at(feedback.correct, 0.0, error, 0.0, 30.0)
-    feedback.enable()
+    feedback.switch(True)
     assert feedback.enabled
     for i in range(1, 400):
         since = dt * (i - 1)
@@ -353,7 +353,7 @@ def test_the_derivative_is_ready_when_feedback_is_enabled():
     feedback, speed = made(PidGains(0.0, 0.0, 1e4, 0.3), FREE, release_time=INF), 1e-5
     for i in range(1000):
         if i == 500:
-            feedback.enable()
+            feedback.switch(True)
         assert at(feedback.correct, 0.01 * i, 0.0, 0.01 * i * speed, 30.0) == pytest.approx(30.0, abs=1e-6)
     assert at(feedback.correct, 10.0, 0.0, 10.0 * speed + 1e-6, 30.0) < 30.0 - 1e-3
 
@@ -362,7 +362,7 @@ def test_the_derivative_is_ready_when_feedback_is_enabled():
 def test_disabled_the_correction_fades_with_the_release_time(samples, release_time):
     feedback = taken_over(PidGains(1e6), release_time=release_time)
     assert at(feedback.correct, 1.0, 9e-6, 0.0, 20.0) == pytest.approx(29.0)
-    feedback.disable()
+    feedback.switch(False)
     assert not feedback.enabled
     t = 1.0
     for dt, measures in samples:
@@ -377,7 +377,7 @@ def test_what_no_voltage_showed_need_not_fade():
     feedback = taken_over(PidGains(1e8), STAGE, longest_gap=2.0, release_time=1.0)
     assert at(feedback.correct, 1.0, 1e-5, 0.0, 60.0) == 100.0
     assert feedback.correction == 40.0
-    feedback.disable()
+    feedback.switch(False)
     assert at(feedback.hold, 2.0, 60.0) == pytest.approx(60.0 + 40.0 / np.e)
 
 
@@ -393,11 +393,11 @@ def test_enabling_what_is_enabled_and_disabling_what_is_not_change_nothing():
     feedback, twin = (taken_over() for _ in range(2))
     at(feedback.correct, 0.1, 1e-6, 0.0, 10.0)
     at(twin.correct, 0.1, 1e-6, 0.0, 10.0)
-    feedback.enable()
+    feedback.switch(True)
     assert at(feedback.correct, 0.2, 2e-6, 0.0, 10.0) == at(twin.correct, 0.2, 2e-6, 0.0, 10.0)
     for _ in range(2):
-        feedback.disable()
-    twin.disable()
+        feedback.switch(False)
+    twin.switch(False)
     assert at(feedback.hold, 0.25, 10.0) == at(twin.hold, 0.25, 10.0)
 
 
@@ -424,7 +424,7 @@ def test_after_forgetting_the_next_measurement_takes_over_without_a_jump():
 def test_without_release_the_correction_stays():
     feedback = taken_over(PidGains(1e6), release_time=INF)
     at(feedback.correct, 0.1, 3e-6, 0.0, 10.0)
-    feedback.disable()
+    feedback.switch(False)
     assert [at(feedback.hold, t, 10.0) for t in (0.2, 1e6)] == [13.0, 13.0]
 
 
@@ -452,7 +452,7 @@ def test_a_gap_integrates_no_longer_than_allowed(seconds, held):
 def test_a_gap_fades_no_longer_than_allowed():
     feedback = taken_over(PidGains(1e6), longest_gap=0.2, release_time=1.0)
     at(feedback.correct, 0.1, 1e-5, 0.0, 0.0)
-    feedback.disable()
+    feedback.switch(False)
     assert at(feedback.hold, 3600.0, 0.0) == pytest.approx(10.0 * np.exp(-0.2))
 
 
@@ -484,7 +484,7 @@ def test_samples_that_make_no_sense_move_nothing(sample, active):
     feedback = taken_over()
     at(feedback.correct, 1.0, 2e-6, 1e-6, 10.0)
     if not active:
-        feedback.disable()
+        feedback.switch(False)
     before = dict(vars(feedback))
     with pytest.raises(UsageError, match="^[^\n]+$"):
         at(feedback.correct, *sample)

@@ -248,7 +248,7 @@ class Amplifier(Rule):
         """Return a constant gain or offset that explains all reports, and whether they have followed a motion."""
         # The reports may be late by up to the window. Gain and offset at once are none: any two voltages lie on a line.
         times, given, reported = np.array(self._pairs).T
-        best: tuple[float, float, Calibration, bool] | None = None
+        explained: list[tuple[float, float, Calibration, bool]] = []
         for late in np.arange(0.0, self.window_ns, PIECE_NS):
             used = times - late - 2.0 * PIECE_NS >= self._begun_ns
             if np.count_nonzero(used) < FEWEST:
@@ -272,9 +272,8 @@ class Amplifier(Rule):
                 if share < EXPLAINED or (moved.any() and float(near[moved].mean()) < EXPLAINED_MOVING):
                     continue
                 error = float(np.abs(found.gain * middle + found.offset - r).mean())
-                if best is None or (-share, error) < best[:2]:
-                    best = -share, error, found, self._followed(middle, r, v, found.gain)
-        return best[2:] if best else (None, False)
+                explained.append((-share, error, found, self._followed(middle, r, v, found.gain)))
+        return min(explained, key=lambda each: each[:2])[2:] if explained else (None, False)
 
     def _followed(self, middle: FloatArray, r: FloatArray, v: FloatArray, gain: float) -> bool:
         """Return whether reports `r` (V), voltages `v` by a gain, have followed a motion of the outputs `middle`."""

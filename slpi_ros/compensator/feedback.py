@@ -67,11 +67,6 @@ class Feedback:
         self._latest: tuple[float, float | None] | None = None  # that one (m), and the setpoint (m) at that time
         self._desired: float | None = None
 
-    @property
-    def saturated(self) -> bool:
-        """Whether the correction is at its limit."""
-        return abs(self.correction) >= self.correction_limit
-
     def switch(self, on: bool) -> None:
         """Enable the PID without a voltage step at the next measurement, or let the correction decay; if it is not."""
         if on and not self.enabled:

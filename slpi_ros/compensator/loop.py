@@ -67,7 +67,7 @@ class Loop:
             return "fault"
         if not (self.closed and self._feedback.acting):
             return "holding"
-        return "saturated" if self._feedback.saturated else "on"
+        return "saturated" if abs(self.correction) >= self.settings.correction_limit else "on"
 
     @property
     def drift(self) -> Drift | None:

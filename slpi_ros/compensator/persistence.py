@@ -10,7 +10,6 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import Any
 
 from slpi_ros.errors import ModelError
 from slpi_ros.io.atomic_file import all_or_nothing, remove_file
@@ -218,7 +217,7 @@ def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
         name: SavedAxis(
             tuple(map(float, axis["went_through_V"])),
             axis["certain"],
-            zero=_zero(axis.get("zero")),
+            zero=Zero(zero["from"], float(zero["offset_m"]), zero["at"]) if (zero := axis.get("zero")) else Zero(),
             relaxing={effect: tuple(map(float, each)) for effect, each in axis.get("relaxing_m", {}).items()},
             age=age,
         )
@@ -285,10 +284,6 @@ def _mark(text: str) -> int:
 
 def _beside(path: str | os.PathLike[str]) -> str:
     return f"{os.fspath(path)}.last"
-
-
-def _zero(saved: Mapping[str, Any] | None) -> Zero:
-    return Zero(saved["from"], float(saved["offset_m"]), saved["at"]) if saved else Zero()
 
 
 def _refuse(constant: str) -> float:

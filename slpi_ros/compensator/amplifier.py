@@ -132,18 +132,12 @@ class Amplifier(Rule):
             return self.limits.noises * median(self._differences) / NORMAL_DIFFERENCE
         # Of steady voltages there are too few yet: second differences of the last reports, which even motion is not in.
         # Uneven motion is, which must not pass for noise.
-        last = [v for _, v in self._reports][-DIFFERENCES:]
-        bends = [abs(c - 2.0 * b + a) for a, b, c in zip(last, last[1:], last[2:], strict=False)]
-        noise = self.limits.noises * median(bends) / NORMAL_BEND if bends else 0.0
+        bends = np.abs(np.diff([v for _, v in self._reports][-DIFFERENCES:], 2))
+        noise = self.limits.noises * float(np.median(bends)) / NORMAL_BEND if bends.size else 0.0
         return min(noise, self.limits.share * self.span)
 
-    @property
-    def tolerance(self) -> float:
-        """Largest difference (V) between a report and an output voltage that means nothing."""
-        return self._tolerance()
-
-    def _tolerance(self, gain: float = 1.0) -> float:
-        """Return the tolerance (V) of voltages that are reports divided by a gain."""
+    def tolerance(self, gain: float = 1.0) -> float:
+        """Return the largest difference (V) of an output voltage from a report, over its gain, that means nothing."""
         return max(self.limits.share * self.span, self._noise / gain) + self.slack
 
     @property
@@ -169,7 +163,7 @@ class Amplifier(Rule):
         if before is not None and high == low:
             self._differences.append(abs(voltage - before))
         self._pairs.append((now_ns, self._last, voltage))
-        there, tolerance = self.calibration.voltage(voltage), self._tolerance(self.calibration.gain)
+        there, tolerance = self.calibration.voltage(voltage), self.tolerance(self.calibration.gain)
         outside = "" if low - tolerance <= there <= high + tolerance else "outside"
         if self._outside.note(outside, now_ns, self.limits.lasts_ns):
             self._judge(low, high, voltage)
@@ -210,7 +204,7 @@ class Amplifier(Rule):
         levels = self._levels.since(now_ns - for_ns + PIECE_NS - 1)
         oldest_ns = min([last[0][0], *(number * PIECE_NS for number, _, _ in levels)])
         values = [v for _, v in last] + [v for _, low, high in levels for v in (low, high)]
-        if now_ns - oldest_ns < for_ns * 0.9 or max(values) - min(values) > 2.0 * self.tolerance:
+        if now_ns - oldest_ns < for_ns * 0.9 or max(values) - min(values) > 2.0 * self.tolerance():
             return None
         recent = [v for t, v in self._reports if now_ns - t <= for_ns]
         return self.calibration.voltage(median(recent or [v for _, v in last]))
@@ -254,7 +248,7 @@ class Amplifier(Rule):
         """Return a constant gain or offset that explains all reports, and whether they have followed a motion."""
         # The reports may be late by up to the window. Gain and offset at once are none: any two voltages lie on a line.
         times, given, reported = np.array(self._pairs).T
-        best: tuple[float, float, Calibration, bool] | None = None
+        explained: list[tuple[float, float, Calibration, bool]] = []
         for late in np.arange(0.0, self.window_ns, PIECE_NS):
             used = times - late - 2.0 * PIECE_NS >= self._begun_ns
             if np.count_nonzero(used) < FEWEST:
@@ -265,28 +259,27 @@ class Amplifier(Rule):
             low, high, r = ends.min(axis=0), ends.max(axis=0), reported[used]
             middle = ends[1]
             power = float(middle @ middle)
-            moved = np.abs(middle - middle[-1]) > self.tolerance
+            moved = np.abs(middle - middle[-1]) > self.tolerance()
             for found in (
                 Calibration(1.0, float(np.median(r - middle))),
                 Calibration(float(middle @ r) / power if power > 0.0 else 0.0),
             ):
                 if not GAINS[0] <= found.gain <= GAINS[1]:
                     continue
-                v, tolerance = (r - found.offset) / found.gain, self._tolerance(found.gain)
+                v, tolerance = (r - found.offset) / found.gain, self.tolerance(found.gain)
                 near = (low - tolerance <= v) & (v <= high + tolerance)
                 share = float(near.mean())
                 if share < EXPLAINED or (moved.any() and float(near[moved].mean()) < EXPLAINED_MOVING):
                     continue
                 error = float(np.abs(found.gain * middle + found.offset - r).mean())
-                if best is None or (-share, error) < best[:2]:
-                    best = -share, error, found, self._followed(middle, r, v, found.gain)
-        return best[2:] if best else (None, False)
+                explained.append((-share, error, found, self._followed(middle, r, v, found.gain)))
+        return min(explained, key=lambda each: each[:2])[2:] if explained else (None, False)
 
     def _followed(self, middle: FloatArray, r: FloatArray, v: FloatArray, gain: float) -> bool:
         """Return whether reports `r` (V), voltages `v` by a gain, have followed a motion of the outputs `middle`."""
         span, moved = float(np.ptp(middle)), float(np.ptp(r))
         # Noise divided by a small gain is no motion.
-        if min(span, moved / gain) < MOVED * self.tolerance or moved < MOVED * self._noise:
+        if min(span, moved / gain) < MOVED * self.tolerance() or moved < MOVED * self._noise:
             return False
         # At the voltages between, too: a jump of somebody else beside a move of this node is no gain.
         between = np.abs(middle - 0.5 * (middle.min() + middle.max())) < (0.5 - BETWEEN) * span

@@ -178,7 +178,7 @@ class Axis:
         Before the first voltage, the measurements choose among the initial states.
         """
         assert self.model
-        if abs(voltage - self.stream.voltage) > self.amplifier.tolerance:
+        if abs(voltage - self.stream.voltage) > self.amplifier.tolerance():
             self.loop.leave(self.stream)
             self.stream.drive(voltage)
             if self.confidence.state != RESETTING:

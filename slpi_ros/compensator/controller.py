@@ -346,8 +346,8 @@ class Controller:
         for axis in axes:
             if not following:
                 axis.end_ramp(now_ns)
-            stamps = axis.samples.stamps
-            aheads.append(stamps.accept(stamp_ns) if stamp_ns else stamps.arrive(arrival_ns))
+            samples = axis.samples
+            aheads.append(samples.accept(stamp_ns) if stamp_ns else samples.arrive(arrival_ns))
         held, slewing = self._move(axes, names, displacements, aheads, now_ns)
         self.counts.note(aheads, self.messages.jump, held, slewing)
         return held

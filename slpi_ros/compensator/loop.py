@@ -30,9 +30,11 @@ class Loop:
     what is reported only. Times: steady clock, ns.
     """
 
+    _sensor: StreamingSensor  # from the first model on
+    # From the first reading on, when the loop is `closed`.
     _applied: StreamingInverse
+    _feedback: Feedback
     _residuals: ResidualWindow
-    _sensor: StreamingSensor
 
     def __init__(self, settings: LoopSettings, output: RateLimiter, axis: str = "") -> None:
         self.settings, self._output = settings, output
@@ -40,7 +42,6 @@ class Loop:
         self.active = False  # whether readings correct it
         self.fault: Finding | None = None  # for which the feedback was switched off
         self.sensor = SensorRule(1.0, axis=axis)  # whether its readings follow the model
-        self._feedback: Feedback | None = None
         # Measured - model, with the time (ns), also where the measurement is refused.
         self._offsets: deque[tuple[int, float]] = deque(maxlen=OFFSETS)
         # Setpoint and displacement of the model as a sensor with delay or lag reads them; None without these.
@@ -55,7 +56,7 @@ class Loop:
     @property
     def correction(self) -> float:
         """Correction contained in the present voltage, volts."""
-        return self._feedback.correction if self._feedback else 0.0
+        return self._feedback.correction if self.closed else 0.0
 
     @property
     def state(self) -> str:
@@ -64,18 +65,18 @@ class Loop:
             return "off"
         if self.fault:
             return "fault"
-        if not (self._feedback and self._feedback.acting):
+        if not (self.closed and self._feedback.acting):
             return "holding"
-        return "saturated" if self._feedback.saturated else "on"
+        return "saturated" if abs(self.correction) >= self.settings.correction_limit else "on"
 
     @property
     def drift(self) -> Drift | None:
         """Residual (measured - model) statistics; None if there are too few measurements."""
-        return self._residuals.drift() if self._feedback else None
+        return self._residuals.drift() if self.closed else None
 
     def applied(self, stream: StreamingInverse) -> StreamingInverse:
         """Return the inverse that follows the total voltage: that of the axis, `stream`, before the first reading."""
-        return self._applied if self._feedback else stream
+        return self._applied if self.closed else stream
 
     def offset(self, now_ns: int) -> float | None:
         """Return the present measured - model displacement (m); None without a measurement in the last 0.2 s."""
@@ -94,7 +95,7 @@ class Loop:
         self.sensor.span, self.sensor.noise = high - low, model.quality.floor_rms
         self._sensor = model.streaming_sensor()
         self._setpoint = Sensed(self._sensor, stream.uncoupled_displacement) if self._sensor.late else None
-        if self._feedback:
+        if self.closed:
             self._applied = continue_from(model, allowed, self._applied)
             self._forget_residuals()
         elif self.settings.enabled:
@@ -106,11 +107,11 @@ class Loop:
             # What the sensor told before does not count any more.
             self.sensor.begin(now_ns)
         self.settings, self.fault, self.active = settings, None, self.closed and settings.enabled
-        feedback = self._feedback
-        if feedback is None:
+        if not self.closed:
             if settings.enabled and stream is not None:
                 self.close(stream, now_ns)
             return
+        feedback = self._feedback
         feedback.correction_limit = settings.correction_limit
         try:
             feedback.retune(settings.gains)
@@ -118,43 +119,35 @@ class Loop:
             # The last measurement gives no finite voltage with the new gains.
             feedback.forget()
             feedback.retune(settings.gains)
-        if settings.enabled:
-            feedback.enable()
-        else:
-            feedback.disable()
+        feedback.switch(settings.enabled)
 
     def close(self, stream: StreamingInverse, now_ns: int) -> None:
         """Start to follow the total voltage, at present that of the inverse `stream` of the axis."""
         self._applied = stream.copy()
-        self._residuals = ResidualWindow(self._applied.uncoupled_displacement)
         self._forget_residuals()
         self.restart(stream, now_ns)
 
     def restart(self, stream: StreamingInverse, now_ns: int) -> None:
         """Restart the feedback at the present voltage and rate, without a correction."""
-        settings, output = self.settings, self._output
-        self._feedback = feedback = Feedback(
-            settings.gains, output.limits, output.voltage, correction_limit=settings.correction_limit
-        )
-        feedback.begin(now_ns)
+        settings = self.settings
+        self._feedback = Feedback(settings.gains, self._output, settings.correction_limit)
         # The feedforward has a rate limiter of its own, beside that of the total voltage.
-        feedback.pace, stream.pace = output, output.copy()
+        stream.pace = self._output.copy()
         self.sensor.begin(now_ns)
         self.closed, self.active = True, settings.enabled
         self.driven_ns = self.due_ns = now_ns
         self._between = 0.0
-        if settings.enabled and not self.fault:
-            feedback.enable()
+        self._feedback.switch(settings.enabled and not self.fault)
 
     def leave(self, stream: StreamingInverse) -> None:
         """Let the inverse of the axis go on from the total voltage."""
-        if self._feedback:
+        if self.closed:
             stream.restore(self._applied.snapshot())
         stream.pace = self._output
 
     def settle(self, stream: StreamingInverse, now_ns: int) -> None:
         """Start again after motion without setpoints."""
-        if self._feedback:
+        if self.closed:
             self.restart(stream, now_ns)
             self._forget_residuals()
         if self._setpoint:
@@ -169,14 +162,13 @@ class Loop:
         `within` the accepted displacements is corrected.
         """
         x = self._sensor.correct(y) if within else y
-        sensed = self._expected.span(now_ns) if self._expected and self._feedback else ()
+        sensed = self._expected.span(now_ns) if self._expected else ()
         if fresh and isfinite(x):
             self._offsets.append((now_ns, x - (sensed[-1] if sensed else expected)))
         return x
 
     def measure(self, x: float, expected: float, now_ns: int, watched: bool, tracking: TrackingStatistics) -> None:
         """Compare a displacement (m) from `read` with model and setpoint; `watched`: a fault of the sensor counts."""
-        assert self._feedback
         sensed = self._expected.span(now_ns) if self._expected else ()
         for each in sensed:
             self._residuals.expect(each)
@@ -192,9 +184,8 @@ class Loop:
 
     def switch_off(self, fault: Finding) -> None:
         """Switch the feedback off because of a fault of its sensor."""
-        assert self._feedback
         self.fault = fault
-        self._feedback.disable()
+        self._feedback.switch(False)
 
     def forget_offsets(self) -> None:
         """Forget the offsets: the zero has moved."""
@@ -215,16 +206,14 @@ class Loop:
         return self._output_with(dt, y, v, coupled, now_ns, self._period_ns)
 
     def _output_with(self, dt: float, y: float, v: float, coupled: float, now_ns: int, early_ns: int = 0) -> float:
-        feedback, applied = self._feedback, self._applied
-        assert feedback
-        period_ns = self._period_ns
+        applied, period_ns = self._applied, self._period_ns
         begin_ns = (now_ns - early_ns) // period_ns * period_ns
         first, self._corrected_ns = begin_ns > self._corrected_ns, max(begin_ns, self._corrected_ns)
         applied.coupled = coupled
         if dt > MAX_DT:
             applied.wait(dt - MAX_DT)
             dt = MAX_DT
-        v = feedback.step(y, v, now_ns, self.settings.timeout if first else None)
+        v = self._feedback.step(y, v, now_ns, self.settings.timeout if first else None)
         self.driven_ns = now_ns
         # At the end of the period after this one; a voltage that moves within an acceleration limit goes on in each.
         self.due_ns = self._corrected_ns + 2 * period_ns
@@ -235,7 +224,7 @@ class Loop:
 
     def follow(self, voltage: float, dt: float, now_ns: int) -> None:
         """Follow a voltage (V) without setpoint, `dt` (s) after the last one."""
-        if self._feedback:
+        if self.closed:
             self.driven_ns, self._between = now_ns, 0.0
             self._expect(self._applied.drive(voltage, dt), now_ns)
 
@@ -254,5 +243,5 @@ class Loop:
     def _forget_residuals(self) -> None:
         """Discard the residuals, as the model or the state of its hysteresis has changed."""
         displacement = self._applied.uncoupled_displacement
-        self._residuals.forget(displacement)
+        self._residuals = ResidualWindow(displacement)
         self._expected = Sensed(self._sensor, displacement + self._applied.coupled) if self._sensor.late else None

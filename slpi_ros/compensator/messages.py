@@ -21,7 +21,7 @@ class Messages:
         """Replace the rules for time stamps."""
         self.jump, self._max_age_ns = rules.jump, int(rules.max_age * SECOND_NS)
         for axis in self.by_name.values():
-            axis.samples.stamps.jump_ns = int(rules.jump * SECOND_NS)
+            axis.samples.jump_ns = int(rules.jump * SECOND_NS)
 
     @property
     def needs_arrival(self) -> bool:
@@ -51,7 +51,7 @@ class Messages:
                 axis.check(y)
             if stamp_ns:
                 for axis in axes:
-                    axis.samples.stamps.check(stamp_ns)
+                    axis.samples.check(stamp_ns)
         except RejectedError as error:
             raise RejectedError(error.cause, f"axis '{axis.name}': {error}") from None
         if stamp_ns and 0 < self._max_age_ns < arrival_ns - stamp_ns:

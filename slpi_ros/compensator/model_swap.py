@@ -38,8 +38,7 @@ def take_over(
     if not reversal_voltages:
         return axis.stream_from(axis.memory(start_memory), allowed)
     present = reversal_voltages[-1]
-    memory = axis.memory("start")
-    replay(memory, reversal_voltages)
+    memory = replayed(axis, reversal_voltages)
     # No step: a voltage just outside the limits returns with the next samples, within slew and acceleration limits.
     stream = axis.stream_from(memory, extended_to(allowed, present))
     stream.limits = allowed
@@ -48,8 +47,7 @@ def take_over(
 
 def continue_from(axis: AxisModel, allowed: Limits, before: StreamingInverse) -> StreamingInverse:
     """Return a streaming inverse of a new model in the state of `before`; limits are widened to include its voltage."""
-    memory = axis.memory("start")
-    replay(memory, turning_voltages(before.memory))
+    memory = replayed(axis, turning_voltages(before.memory))
     stream = axis.stream_from(memory, extended_to(extended_to(allowed, before.voltage), memory.voltage))
     stream.resume(before)
     return stream
@@ -68,10 +66,12 @@ def voltage_history(stream: StreamingInverse) -> tuple[float, ...]:
     return turns if turns[-1] == stream.voltage else (*turns, stream.voltage)
 
 
-def replay(memory: Memory, voltages: Sequence[float]) -> None:
-    """Apply reversal voltages (V), oldest first, to a memory."""
+def replayed(axis: AxisModel, voltages: Sequence[float]) -> Memory:
+    """Return the memory of a model after reversal voltages (V), oldest first."""
+    memory = axis.memory("start")
     for v in voltages:
         memory.forward(v)
+    return memory
 
 
 def check_inverse(axis: AxisModel, allowed: Limits) -> None:
@@ -130,9 +130,9 @@ class InitialState:
         allowed = max(noise, FIT_SHARE * (high - low))
         if max(recent) - min(recent) > 2.0 * allowed:
             return None, None
-        assumed, streams, errors = self.assumed, dict[StartMemory, StreamingInverse](), dict[StartMemory, float]()
-        for name in START_MEMORIES:
-            streams[name] = stream = take_over(model, limits, (), name)
+        assumed, errors = self.assumed, dict[StartMemory, float]()
+        streams = {name: take_over(model, limits, (), name) for name in START_MEMORIES}
+        for name, stream in streams.items():
             stream.coupled = present.coupled
             stream.surround(surroundings)
             errors[name] = abs(measured - stream.drive(present.voltage))

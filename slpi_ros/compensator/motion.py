@@ -229,13 +229,9 @@ class Ramp(Motion):
     def __init__(self, goals: Iterable[float], rate: float) -> None:
         super().__init__()
         self._goals, self._rate = list(goals)[::-1], rate
+        self.done = not self._goals  # whether the last target voltage has been reached
         if not rate > 0.0 or not all(-inf < goal < inf for goal in self._goals):
             raise UsageError(f"a ramp at {rate} V/s through {self._goals[::-1]} V; give a positive rate, finite goals")
-
-    @property
-    def done(self) -> bool:
-        """Whether the last target voltage has been reached."""
-        return not self._goals
 
     def next(self, pace: RateLimiter, now_ns: int) -> float:
         """Return the next voltage (V) at `now_ns` (ns), as the rate limiter `pace` allows."""
@@ -245,6 +241,7 @@ class Ramp(Motion):
         v = pace.step(goal, now_ns, min(self._rate, PLANNED_SHARE * pace.limits.slew) if self._rate < inf else inf)
         if abs(v - goal) <= NEAR:
             self._goals.pop()
+            self.done = not self._goals
         return v
 
     def step(self, axis: Moved, now_ns: int) -> None:
@@ -265,17 +262,12 @@ class Brake(Ramp):
 
     def __init__(self) -> None:
         super().__init__((), inf)
-        self._moving = True
-
-    @property
-    def done(self) -> bool:
-        """Whether the voltage is at rest."""
-        return not self._moving
+        self.done = False
 
     def next(self, pace: RateLimiter, now_ns: int) -> float:
         """Return the next voltage (V) at `now_ns` (ns), as the rate limiter `pace` allows."""
         v = pace.brake(now_ns)
-        self._moving = pace.in_motion
+        self.done = not pace.in_motion
         return v
 
 

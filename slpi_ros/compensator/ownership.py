@@ -55,18 +55,19 @@ class Ownership:
 
     def _find(self, axis: Axis, start: str | float, now_ns: int) -> tuple[float | None, str]:
         """Return the voltage (V) at which an axis starts, and what is not certain about it; None: not known yet."""
+        v = axis.voltage
         if isinstance(start, float):
             # Later, the voltage of this node is known better.
-            return (axis.voltage if self._ever else start), ""
+            return (v if self._ever else start), ""
         if start == SAVED:
-            return axis.voltage, ""
+            return v, ""
         found = axis.amplifier.found(now_ns, self._since_ns)
         if found is not None:
             if reason := self._impossible(axis, found):
                 return None, reason
             # The last output is known better than a noisy report of it.
-            same = self._ever and abs(found - axis.voltage) <= axis.amplifier.scatter
-            return (axis.voltage if same else found), ""
+            same = self._ever and abs(found - v) <= axis.amplifier.scatter
+            return (v if same else found), ""
         awaited = self.reporting and (now_ns - self._since_ns < MUTE_NS or axis.amplifier.latest is not None)
         if start == MEASURED or awaited:
             return None, (
@@ -74,16 +75,12 @@ class Ownership:
                 "start_voltage"
             )
         if self._ever:
-            return axis.voltage, ""
+            return v, ""
+        why, at, checked = "nobody reports the voltage of the amplifier (effort of stage_state)", volts(v), "that"
         if self.reporting:
-            return axis.voltage, (
-                f"stage_state holds no usable voltage of this axis (effort); it is taken to be at {axis.voltage:.4g} "
-                "V: check the driver before you send anything, or set start_voltage"
-            )
-        return axis.voltage, (
-            f"nobody reports the voltage of the amplifier (effort of stage_state); it is taken to be at "
-            f"{volts(axis.voltage)} V: check that before you send anything, or set start_voltage"
-        )
+            why, at, checked = "stage_state holds no usable voltage of this axis (effort)", f"{v:.4g}", "the driver"
+        taken = f"it is taken to be at {at} V: check {checked} before you send anything, or set start_voltage"
+        return v, f"{why}; {taken}"
 
     def begin_output(self, now_ns: int) -> None:
         """Find the voltages at the start once more, and take them to be those of the amplifiers, or reject."""

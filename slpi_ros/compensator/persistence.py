@@ -10,7 +10,6 @@ import zlib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
-from typing import Any
 
 from slpi_ros.errors import ModelError
 from slpi_ros.io.atomic_file import all_or_nothing, remove_file
@@ -65,9 +64,8 @@ class Zero:
         return cls(source, offset, datetime.now(UTC).isoformat(timespec="seconds"))
 
 
-# Head of an entry: identifier of the saved memory that it belongs to, and sequence number.
-HEAD = struct.Struct("<IQ")
-VOLTAGE_BYTES, CHECKSUM_BYTES = 8, 4
+# An entry: identifier of the saved memory that it belongs to, sequence number, voltages, and their checksum.
+HEAD, CHECKSUM = struct.Struct("=IQ"), struct.Struct("=I")
 
 
 class LastVoltages:
@@ -92,8 +90,9 @@ class LastVoltages:
         """Write the voltages (V) of all axes, each as a double in native byte order."""
         self._number = number = self._number + 1
         record = HEAD.pack(self.mark, number) + voltages
+        record += CHECKSUM.pack(zlib.crc32(record))
         try:
-            os.pwrite(self._file, record + zlib.crc32(record).to_bytes(4, "little"), (number & 1) * (len(record) + 4))
+            os.pwrite(self._file, record, (number & 1) * len(record))
         except OSError as error:
             raise ModelError(f"{self._path}: cannot be written: {error.strerror}; free disk space") from None
 
@@ -105,19 +104,18 @@ class LastVoltages:
 
 def read_last_voltages(path: str | os.PathLike[str], mark: int, axes: int) -> tuple[float, ...] | None:
     """Return the last voltages (V) stored with a saved memory; None if no intact entry has the identifier `mark`."""
-    size = HEAD.size + VOLTAGE_BYTES * axes + CHECKSUM_BYTES
+    entry = struct.Struct(f"{HEAD.format}{axes}dI")
     try:
         with open_input(_beside(path), MEMORY_BYTES) as file:
-            data = file.read(2 * size)
+            records = [file.read(entry.size) for _ in range(2)]
     except (OSError, ValueError):
         return None
     found = []
-    for record in (data[:size], data[size:]):
-        body, checksum = record[:-CHECKSUM_BYTES], record[-CHECKSUM_BYTES:]
-        if len(record) == size and zlib.crc32(body) == int.from_bytes(checksum, "little"):
-            belongs_to, number = HEAD.unpack_from(body)
-            if belongs_to == mark:
-                found.append((number, struct.unpack_from(f"{axes}d", body, HEAD.size)))
+    for record in records:
+        if len(record) == entry.size:
+            belongs_to, number, *voltages, checksum = entry.unpack(record)
+            if belongs_to == mark and checksum == zlib.crc32(record[: -CHECKSUM.size]):
+                found.append((number, tuple(voltages)))
     return max(found)[1] if found else None
 
 
@@ -219,7 +217,7 @@ def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
         name: SavedAxis(
             tuple(map(float, axis["went_through_V"])),
             axis["certain"],
-            zero=_zero(axis.get("zero")),
+            zero=Zero(zero["from"], float(zero["offset_m"]), zero["at"]) if (zero := axis.get("zero")) else Zero(),
             relaxing={effect: tuple(map(float, each)) for effect, each in axis.get("relaxing_m", {}).items()},
             age=age,
         )
@@ -233,38 +231,26 @@ def load_memory(path: str | os.PathLike[str]) -> SavedMemory | None:
 
 
 class MemoryFile:
-    """Save and restore the memory of a stage, with the voltages since the last save; an empty `path`: nothing."""
+    """Save the memory of a stage whenever it has changed, with the voltages since the last save."""
 
     def __init__(self, path: str) -> None:
-        self._path = path
-        self.last_voltages: dict[str, float] = {}  # V by axis, as found, also if nothing else was usable
-        self._saved: SavedMemory | None = None
+        self.path = path
+        self._saved: SavedMemory | None = None  # by this process
         self._last: LastVoltages | None = None
 
-    def find(self, model: StageModel, names: Sequence[str]) -> Mapping[str, SavedAxis] | None:
-        """Return the saved state of each axis, None without file; ModelError if it is not of `model` and `names`."""
-        saved = load_memory(self._path) if self._path else None
-        if saved is None:
-            return None
-        self.last_voltages = saved.last_voltages
-        saved.require_fit(model, names)
-        return saved.axes
-
-    def save(self, model: StageModel | None, axes: Mapping[str, SavedAxis], complete: bool) -> None:
+    def save(self, model: StageModel, axes: Mapping[str, SavedAxis], complete: bool) -> None:
         """Write the state of `axes` if it has changed; `complete`: no further voltage is output afterwards."""
-        if not self._path or model is None:
-            return
         memory = SavedMemory(model_id(model), complete, axes)
         if memory == self._saved:
             return
         if self._saved is None:
-            _require_no_other(self._path)
+            _require_no_other(self.path)
         try:
-            mark = save_memory(memory, self._path)
+            mark = save_memory(memory, self.path)
         except ModelError:
             if not complete and (self._saved is None or self._saved.complete):
                 # The complete state in the file is no longer the present one, but a crash would make it look so.
-                remove_file(self._path)
+                remove_file(self.path)
             raise
         self._saved = memory
         if self._last and complete:
@@ -273,7 +259,7 @@ class MemoryFile:
         elif self._last:
             self._last.mark = mark
         elif not complete:
-            self._last = LastVoltages(self._path, mark)
+            self._last = LastVoltages(self.path, mark)
 
     def note(self, voltages: bytes) -> None:
         """Store the voltages just output (V, native doubles), for recovery after a crash; called for each command."""
@@ -298,10 +284,6 @@ def _mark(text: str) -> int:
 
 def _beside(path: str | os.PathLike[str]) -> str:
     return f"{os.fspath(path)}.last"
-
-
-def _zero(saved: Mapping[str, Any] | None) -> Zero:
-    return Zero(saved["from"], float(saved["offset_m"]), saved["at"]) if saved else Zero()
 
 
 def _refuse(constant: str) -> float:

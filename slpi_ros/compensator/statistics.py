@@ -1,7 +1,6 @@
 """Message counters, latency and tracking error of a compensator."""
 
-from array import array
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -60,29 +59,24 @@ class Timing:
     """Collect arrival times and latencies of messages."""
 
     def __init__(self) -> None:
-        self._arrived = array("q", bytes(8 * WINDOW))
-        self._took = array("q", bytes(8 * WINDOW))
-        self._count = 0
+        self._arrived, self._took = deque[int](maxlen=WINDOW), deque[int](maxlen=WINDOW)  # ns
 
     def note(self, arrived_ns: int, answered_ns: int) -> None:
         """Store the arrival and answer times of one message, nanoseconds on a monotonic clock."""
-        at = self._count % WINDOW
-        self._arrived[at] = arrived_ns
-        self._took[at] = answered_ns - arrived_ns
-        self._count += 1
+        self._arrived.append(arrived_ns)
+        self._took.append(answered_ns - arrived_ns)
 
     def report(self) -> TimingReport | None:
         """Return the statistics; None if there were fewer than two messages."""
-        count, first = min(self._count, WINDOW), self._count % WINDOW if self._count > WINDOW else 0
-        if count < 2:
+        if len(self._arrived) < 2:
             return None
-        arrived = np.roll(np.frombuffer(self._arrived, np.int64)[:count], -first)
-        p50, p99, longest = np.percentile(np.frombuffer(self._took, np.int64)[:count], (50, 99, 100)) * 1e-9
-        return TimingReport(float(np.diff(arrived).std()) * 1e-9, (float(p50), float(p99), float(longest)))
+        p50, p99, longest = np.percentile(self._took, (50, 99, 100)) * 1e-9
+        return TimingReport(float(np.diff(self._arrived).std()) * 1e-9, (float(p50), float(p99), float(longest)))
 
     def restart(self) -> None:
         """Discard the collected times."""
-        self._count = 0
+        self._arrived.clear()
+        self._took.clear()
 
 
 # Number of measurements in the statistics of the tracking error.
@@ -102,32 +96,24 @@ class TrackingReport:
 class TrackingStatistics:
     """Collect the tracking error (m), measured - desired, of one axis."""
 
-    __slots__ = ("_count", "_errors", "desired", "fresh", "learned")
+    __slots__ = ("_errors", "desired", "fresh", "learned")
 
     def __init__(self) -> None:
         self.desired: float | None = None  # m; None while the axis follows none
         self.learned = 0.0  # m, the part of the setpoint that was learned, which nobody desired
         self.fresh = False  # measured since the last report
-        self._errors = array("d", bytes(8 * TRACKED))
-        self._count = 0
+        self._errors: deque[float] = deque(maxlen=TRACKED)
 
     def measure(self, displacement: float, desired: float | None = None) -> None:
         """Store the error of a displacement (m) from the setpoint it refers to (m), by default the present one."""
         if self.desired is not None:
             setpoint = self.desired if desired is None else desired
-            self._errors[self._count % TRACKED] = displacement - (setpoint - self.learned)
-            self._count += 1
+            self._errors.append(displacement - (setpoint - self.learned))
             self.fresh = True
 
     def report(self) -> TrackingReport:
         """Return the statistics; NaN without any measurement."""
         self.fresh = False
-        if not self._count:
-            return TrackingReport(np.nan, np.nan, np.nan, np.nan)
-        errors = np.frombuffer(self._errors)[: min(self._count, TRACKED)]
-        return TrackingReport(
-            latest=float(errors[(self._count - 1) % TRACKED]),
-            mean=float(errors.mean()),
-            rms=float(np.sqrt(np.mean(errors**2))),
-            maximum=float(np.abs(errors).max()),
-        )
+        errors = np.array(self._errors or [np.nan])
+        rms = float(np.sqrt(np.mean(errors**2)))
+        return TrackingReport(float(errors[-1]), float(errors.mean()), rms, float(np.abs(errors).max()))

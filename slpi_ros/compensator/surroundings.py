@@ -1,7 +1,7 @@
 """Quantities that the stage follows, as they come in use: which values are taken, and what is wrong with the others."""
 
 from collections.abc import Mapping, Sequence
-from math import isfinite, nan
+from math import nan
 
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.effects.base import Followed
@@ -28,7 +28,7 @@ class Surrounding:
     def note(self, value: float, now_ns: int) -> bool:
         """Take a value that came at `now_ns` (ns, steady clock); return whether it is used."""
         low, high = self.accepted
-        if not (isfinite(value) and low <= value <= high):
+        if not low <= value <= high:
             self.refused = value
             return False
         if self._came_ns is not None:

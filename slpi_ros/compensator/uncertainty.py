@@ -73,9 +73,8 @@ class Uncertainty:
         """Follow a displacement (m) and its voltage (V), `dt` (s) after the last sample."""
         if self._streaming is None:
             return
-        if self._waited:
-            dt, self._waited = max(dt - self._waited, 0.0), 0.0
-        self._t += dt
+        self._t += max(dt - self._waited, 0.0)
+        self._waited = 0.0
         self._streaming.note(self._t, y, v)
 
     def wait(self, dt: float, y: float, v: float) -> None:

@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from math import isfinite
 
 from slpi_ros.errors import SlpiError
-from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.streaming import refusal
 
 NO_MODEL = "no_model"
@@ -63,47 +62,3 @@ class TimestampRules:
 
     jump: float = 1.0  # s, the largest step back of a late stamp; beyond it the clock was set back, or forward a gap
     max_age: float = 0.0  # s, beyond which messages are stale; 0 disables the check
-
-
-class Stamps:
-    """Check the order of the sample time stamps of one axis and compute elapsed times."""
-
-    # A stamp that is older than the last one by at most `jump_ns` is late. If it is older by more than this, the clock
-    # was set back, and the elapsed time restarts.
-    __slots__ = ("_last_ns", "_restarted", "jump_ns")
-
-    def __init__(self, jump_ns: int = SECOND_NS) -> None:
-        self.jump_ns = jump_ns
-        self._last_ns: int | None = None
-        # Whether the axis has moved without stamps since the last one.
-        self._restarted = False
-
-    def check(self, stamp_ns: int) -> None:
-        """Reject a stamp (ns) that is not newer than the last one, unless the clock was set back."""
-        last = self._last_ns
-        if last is None or stamp_ns > last or stamp_ns < last - self.jump_ns:
-            return
-        if stamp_ns == last:
-            raise RejectedError(DUPLICATE, "the stamp equals the last accepted one; stamp each sample anew")
-        back = f"{(last - stamp_ns) * 1e-9:.9g} s"
-        raise RejectedError(TIME_BACKWARDS, f"time runs {back} backwards; send samples in order")
-
-    def accept(self, stamp_ns: int) -> float | None:
-        """Store a stamp (ns) accepted by `check`; return the time (s) since the last stamp."""
-        # It is 0 for the first stamp, negative if the clock was set back, None for the first one after `restart`.
-        last, self._last_ns = self._last_ns, stamp_ns
-        if self._restarted:
-            self._restarted = False
-            return None
-        return (stamp_ns - last) * 1e-9 if last is not None else 0.0
-
-    def arrive(self, now_ns: int) -> float | None:
-        """Accept a sample without stamp that arrived at `now_ns` (ns); return the time (s) since the last stamp."""
-        last = self._last_ns
-        if last is not None and last - self.jump_ns <= now_ns < last:
-            now_ns = last
-        return self.accept(now_ns)
-
-    def restart(self) -> None:
-        """Count no time by stamps up to the next one: the axis moved meanwhile; older stamps are still late."""
-        self._restarted = self._last_ns is not None

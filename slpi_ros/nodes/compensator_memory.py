@@ -8,7 +8,7 @@ from rclpy.node import Node
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.motion import reset_limits
-from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESTORED, MemoryFile, SavedAxis
+from slpi_ros.compensator.persistence import INTERRUPTED, KNOWN, RESTORED, MemoryFile, SavedAxis, load_memory
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import ModelError, SlpiError
 from slpi_ros.model.limits import volts
@@ -29,7 +29,7 @@ class Memory:
 
     def __init__(self, node: Node, controller: Controller, path: str, reporter: Reporter) -> None:
         self._node, self._controller, self._reporter = node, controller, reporter
-        self._file, self._kept = MemoryFile(path), path != ""
+        self._file = MemoryFile(path) if path else None
         self.waits = False  # for the voltages at the start, before it begins
         self._service = DeferredService(node, "~/reset_memory", self._on_reset)
         serve(node, "~/set_zero", self._on_set_zero)
@@ -38,17 +38,21 @@ class Memory:
 
     def find(self, model: StageModel) -> tuple[Mapping[str, SavedAxis] | None, Mapping[str, float] | None]:
         """Return what was saved with a model before the first one, and if it was another one, its last voltages (V)."""
-        if self._controller.axes[0].model:
+        if self._file is None or self._controller.axes[0].model:
             return None, None
+        saved = None
         try:
-            return self._file.find(model, self._controller.names), None
+            saved = load_memory(self._file.path)
+            if saved:
+                saved.require_fit(model, self._controller.names)
         except SlpiError as error:
             self._node.get_logger().warning(str(error))
-            return None, self._file.last_voltages
+            return None, saved.last_voltages if saved else None
+        return saved.axes if saved else None, None
 
     def note(self, voltages: bytes) -> None:
         """Store voltages (V, native doubles) that are about to be published."""
-        if self._kept:
+        if self._file:
             try:
                 self._file.note(voltages)
             except ModelError as error:
@@ -56,12 +60,13 @@ class Memory:
 
     def save(self, *, complete: bool) -> None:
         """Save the memory, or log the error; `complete` means that no further voltage is output afterwards."""
-        if not self._kept or self._controller.model is None:
+        model = self._controller.identified
+        if self._file is None or model is None:
             return
         now_ns = time.monotonic_ns()
         try:
             axes = {axis.name: axis.saved(now_ns) for axis in self._controller.axes}
-            self._file.save(self._controller.identified, axes, complete)
+            self._file.save(model, axes, complete)
         except SlpiError as error:
             self._tell(error)
 

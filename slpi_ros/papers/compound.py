@@ -14,8 +14,9 @@ from slpi_ros.compensator.feedback import Feedback, PidGains
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled, cycles
 from slpi_ros.identification.fit import identify
 from slpi_ros.identification.signal_statistics import ErrorMetrics, error_metrics
+from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.axis_model import AxisModel, Start
-from slpi_ros.model.limits import Limits
+from slpi_ros.model.limits import Limits, RateLimiter
 from slpi_ros.papers.exhibit import Exhibit, Picture, Table, label_axes, panels, um
 from slpi_ros.papers.mpi_exhibits import COLOUR, ERROR, ERRORS, UM, errors, legend
 from slpi_ros.papers.mpi_study import (
@@ -163,14 +164,13 @@ def follow(
     v = np.append(triangles(warm_up, 1.0, WARM_UP, round(RATE))[1], np.zeros(1 + round(rest * RATE)))
     displacement, readings = axis.run(np.arange(v.size) / RATE, v)
     zero, y = float(readings[-1]), float(displacement[-1])
-    control = Feedback(gains or PidGains(0.0), LIMITS)
-    if gains:
-        control.enable()
+    control = Feedback(gains or PidGains(0.0), RateLimiter(LIMITS))
+    control.switch(gains is not None)
     reading, done, read = 0.0, np.empty_like(desired), np.empty_like(desired)
     ahead = np.append(feedforward[1:], feedforward[-1])
     for k, (target, v_ahead) in enumerate(zip(desired.tolist(), ahead.tolist(), strict=True)):
         done[k], read[k] = y - zero, reading
-        voltage = control.correct(k / RATE, target, reading, v_ahead)
+        voltage = control.correct(round(k / RATE * SECOND_NS), target, reading, v_ahead)
         y = axis.step((v.size + k) / RATE, voltage)
         reading = axis.measure(y) - zero
     return Outcome(desired, read, done)

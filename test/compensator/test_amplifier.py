@@ -109,7 +109,7 @@ def test_two_percent_of_the_range_mean_nothing(off):
 def test_the_noise_of_the_reports_widens_what_is_tolerated(noise):
     wired = Wired()
     assert wired.run(np.full(8000, 50.0), lambda v: v + RNG.normal(0.0, noise)) is None
-    assert wired.amplifier.tolerance == pytest.approx(max(2.0, 4.0 * noise), rel=0.5)
+    assert wired.amplifier.tolerance() == pytest.approx(max(2.0, 4.0 * noise), rel=0.5)
     assert wired.run(np.full(3000, 50.0), lambda v: v + 12.0 * noise + RNG.normal(0.0, noise)) is not None
 
 

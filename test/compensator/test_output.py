@@ -12,7 +12,7 @@ from strategies import FAMILY_CASE, axis_model
 from benchmarks.episodes import Episode, Ratios, Wire
 from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.motion import Kind, Safety
-from slpi_ros.compensator.persistence import MemoryFile, SavedAxis
+from slpi_ros.compensator.persistence import MemoryFile, SavedAxis, load_memory
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.lag import Lag
 from slpi_ros.errors import ModelError
@@ -141,9 +141,9 @@ def test_a_memory_file_of_another_model_keeps_its_last_voltage(tmp_path):
     """The saved state was dropped whole, and the voltage jumped from 48 to 92 V."""
     model, names = StageModel({"x": AXIS}), ["x"]
     MemoryFile(str(tmp_path / "m.json")).save(model, {"x": SavedAxis((100.0, 0.0, 48.0), True)}, True)
-    memory = MemoryFile(str(tmp_path / "m.json"))
+    memory = load_memory(tmp_path / "m.json")
     with pytest.raises(ModelError):
-        memory.find(replace(model, created="2030-01-01T00:00:00Z"), names)
+        memory.require_fit(replace(model, created="2030-01-01T00:00:00Z"), names)
     stage = Stage(48.0, reporting=False, last=memory.last_voltages)
     stage.send(0.92 * TOP)
     assert abs(stage.given[0][1] - 48.0) <= 0.4 + 1e-9

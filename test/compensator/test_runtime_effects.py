@@ -114,7 +114,7 @@ def test_a_path_reckons_with_axes_that_another_path_brings_elsewhere():
     follow(made, {"y": PATHS["y"][300:]}, start_ns=START + 300 * MS)
     given = give(made)
     # A pause of y before its path; a jump of x in both.
-    twin.axes[1].samples.stamps.accept(START)
+    twin.axes[1].samples.accept(START)
     expected = np.array([move(twin, k, "x" if k < 300 else "y") for k in range(600)])
     np.testing.assert_allclose(given[:300], expected[:300], rtol=0, atol=1e-9)
     # The end of the path of x is followed by a hold, from three intervals on, at least 20 ms.

@@ -66,9 +66,9 @@ def test_the_last_voltages_outlive_their_model(tmp_path, complete):
     written = MemoryFile(str(path))
     written.save(MODEL, SAVED.axes, complete)
     written.note(as_given(48.0, 3.0))
-    read = MemoryFile(str(path))
+    read = load_memory(path)
     with pytest.raises(ModelError, match="^[^\n]+$"):
-        read.find(replace(MODEL, created="2030-01-01T00:00:00Z"), ["x", "y"])
+        read.require_fit(replace(MODEL, created="2030-01-01T00:00:00Z"), ["x", "y"])
     assert read.last_voltages == ({"x": 1 / 3, "y": -0.1} if complete else {"x": 48.0, "y": 3.0})
 
 

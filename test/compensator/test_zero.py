@@ -8,7 +8,7 @@ from strategies import two_axes
 
 from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
-from slpi_ros.compensator.persistence import CALIBRATION, RESET, SENSOR, MemoryFile
+from slpi_ros.compensator.persistence import CALIBRATION, RESET, SENSOR, MemoryFile, load_memory
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
@@ -113,7 +113,9 @@ def test_it_outlives_a_restart_but_not_another_model(tmp_path):
     file = MemoryFile(str(tmp_path / "memory.json"))
     saved = {axis.name: axis.saved(bench.now_ns) for axis in axes}
     file.save(bench.controller.identified, saved, complete=False)
-    again = MemoryFile(str(tmp_path / "memory.json")).find(PLAIN, NAMES)
+    found = load_memory(tmp_path / "memory.json")
+    found.require_fit(PLAIN, NAMES)
+    again = found.axes
     assert {name: axis.zero for name, axis in again.items()} == {axis.name: axis.zero for axis in axes}
     other = Controller(NAMES, LIMITS)
     other.use_model(PLAIN, again)
@@ -144,7 +146,9 @@ def test_creep_goes_on_over_a_restart(tmp_path):
     bench.now_ns += 500 * MS
     file = MemoryFile(str(tmp_path / "memory.json"))
     file.save(RICH, {each.name: each.saved(bench.now_ns) for each in bench.controller.axes}, complete=True)
-    again = MemoryFile(str(tmp_path / "memory.json")).find(RICH, NAMES)
+    found = load_memory(tmp_path / "memory.json")
+    found.require_fit(RICH, NAMES)
+    again = found.axes
     assert again["x"].relaxing.keys() == {"creep"} and 0.0 <= again["x"].age < 60.0
     other = Controller(NAMES, LIMITS)
     other.use_model(RICH, {name: replace(each, age=1.5) for name, each in again.items()})

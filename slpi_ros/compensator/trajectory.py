@@ -114,74 +114,64 @@ class Point(NamedTuple):
     between: bool = False  # interpolated, not a point of the trajectory
 
 
+@dataclass(eq=False)
 class _Track:
-    """Points (m, (N, names)) of one trajectory for all axes with the same delay, executed in order from `next` on.
+    """Points of one trajectory for all axes with the same delay, executed in order."""
 
-    Only one track of each trajectory is `counted` by `TrajectoryExecutor.remaining`.
-    """
+    names: tuple[str, ...]
+    positions: FloatArray  # m, (N, names)
+    deadlines_ns: memoryview  # access to single elements of an array is several times slower
+    next: int  # the points ``next:stop`` are pending
+    since_ns: int  # the last sample, from which the next point is approached; at first the begin
+    period_ns: int
+    place: Callable[[str], float] | None  # see `TrajectoryExecutor`
+    counted: bool  # by `TrajectoryExecutor.remaining`: only one track of each trajectory is
+    since: list[float] | None = None  # m, the last sample; None: none has been output yet
 
-    def __init__(
-        self,
-        names: tuple[str, ...],
-        positions: FloatArray,
-        deadlines_ns: IntArray,
-        first: int,
-        counted: bool,
-        begin_ns: int,
-        period_ns: int,
-        place: Callable[[str], float] | None,
-    ) -> None:
-        self.names, self.counted, self.begun = names, counted, False
-        self._period_ns, self._place = period_ns, place
-        # A view: access to single elements of the array itself is several times slower.
-        self._positions, self._deadlines_ns = positions, memoryview(deadlines_ns)
-        # The points ``next:stop`` are pending.
-        self.next, self.stop = first, deadlines_ns.size
-        # The last sample, from which the next point is approached; its place is not known before the begin.
-        self._since_ns = begin_ns
-        self._since: list[float] | None = None
+    def __post_init__(self) -> None:
+        self.stop = len(self.deadlines_ns)
         self._aim()
 
     def _aim(self) -> None:
         """Set the deadlines (ns) of the next point and of the next sample, which is on the way to it."""
-        self.deadline_ns = self._deadlines_ns[self.next]
-        self._way_ns = self.deadline_ns - self._since_ns
-        stays = self._since is None and self._place is None
-        self._pieces = 1 if stays else max(round(self._way_ns / self._period_ns), 1)
-        self.next_ns = self._since_ns + self._way_ns // self._pieces
+        self.deadline_ns = self.deadlines_ns[self.next]
+        self._way_ns = self.deadline_ns - self.since_ns
+        stays = self.since is None and self.place is None
+        self._pieces = 1 if stays else max(round(self._way_ns / self.period_ns), 1)
+        self.next_ns = self.since_ns + self._way_ns // self._pieces
 
     def until(self, time_ns: int) -> int:
         """Return the index of the first pending point that is due at `time_ns` or later."""
-        return bisect_left(self._deadlines_ns, time_ns, self.next, self.stop)
+        return bisect_left(self.deadlines_ns, time_ns, self.next, self.stop)
 
     def take(self, now_ns: int) -> tuple[Point, int]:
         """Return the latest sample that is due, and the number of earlier pending points, which are skipped."""
-        skipped, self.begun = 0, True
+        skipped = 0
         if now_ns < self.deadline_ns:
             point = self._between(now_ns)
         else:
             last = self.next
             self.next += 1
-            if self.next < self.stop and self._deadlines_ns[self.next] <= now_ns:
+            if self.next < self.stop and self.deadlines_ns[self.next] <= now_ns:
                 self.next = self.until(now_ns + 1)
                 skipped, last = self.next - 1 - last, self.next - 1
-            point = Point(self.names, self._positions[last].tolist(), self._deadlines_ns[last])
-        self._since_ns, self._since = point.deadline_ns, point.displacements
+            point = Point(self.names, self.positions[last].tolist(), self.deadlines_ns[last])
+        self.since_ns, self.since = point.deadline_ns, point.displacements
         if self.next < self.stop:
             self._aim()
         return point, skipped
 
     def _between(self, now_ns: int) -> Point:
         """Return the latest interpolated sample that is due before the next point."""
-        since = self._since
+        since = self.since
         if since is None:
-            assert self._place
-            since = [self._place(name) for name in self.names]
-        piece = max((now_ns - self._since_ns) * self._pieces // self._way_ns, 1)
+            assert self.place
+            since = [self.place(name) for name in self.names]
+        piece = max((now_ns - self.since_ns) * self._pieces // self._way_ns, 1)
         ahead_ns = self._way_ns * piece // self._pieces
-        share, goal = ahead_ns / self._way_ns, self._positions[self.next].tolist()
+        share, goal = ahead_ns / self._way_ns, self.positions[self.next].tolist()
         places = [y + share * (end - y) for y, end in zip(since, goal, strict=True)]
-        return Point(self.names, places, self._since_ns + ahead_ns, between=True)
+        return Point(self.names, places, self.since_ns + ahead_ns, between=True)
 
 
 class TrajectoryExecutor:
@@ -218,12 +208,12 @@ class TrajectoryExecutor:
     @property
     def moving(self) -> set[str]:
         """Names of the axes that are on their way along a trajectory."""
-        return {name for track in self._tracks if track.begun for name in track.names}
+        return {name for track in self._tracks if track.since for name in track.names}
 
     @property
     def begun(self) -> bool:
         """Whether a pending trajectory has already output a sample."""
-        return any(track.begun for track in self._tracks)
+        return bool(self.moving)
 
     def start(
         self,
@@ -248,8 +238,8 @@ class TrajectoryExecutor:
             positions = useful.positions if len(columns) == len(useful.names) else useful.positions[:, columns]
             names = tuple(useful.names[i] for i in columns)
             begin_ns = max(trajectory.start_ns - shift, now_ns) if trajectory.start_ns else now_ns
-            period_ns = round(self.period * SECOND_NS)
-            tracks.append(_Track(names, positions, deadlines, first, not tracks, begin_ns, period_ns, self._place))
+            period_ns, counted = round(self.period * SECOND_NS), not tracks
+            tracks.append(_Track(names, positions, deadlines.data, first, begin_ns, period_ns, self._place, counted))
         begin_ns = min(track.next_ns for track in tracks)
         kept = self._tracks if trajectory.start_ns else []
         for track in kept:

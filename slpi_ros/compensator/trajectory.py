@@ -210,11 +210,6 @@ class TrajectoryExecutor:
         """Names of the axes that are on their way along a trajectory."""
         return {name for track in self._tracks if track.since for name in track.names}
 
-    @property
-    def begun(self) -> bool:
-        """Whether a pending trajectory has already output a sample."""
-        return bool(self.moving)
-
     def start(
         self,
         trajectory: Trajectory,

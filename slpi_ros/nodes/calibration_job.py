@@ -33,12 +33,8 @@ class Wanted:
     desired: FloatArray  # m, (N, axes), or (N, 0) if there is none
 
 
-@dataclass(frozen=True)
-class CalibrationRequest:
-    """What the worker needs; `output` is the folder of bags and results."""
-
-    settings: CalibrationSettings
-    output: Path
+# Settings, and the folder of bags and results.
+CalibrationRequest = tuple[CalibrationSettings, Path]
 
 
 @dataclass(frozen=True)
@@ -56,8 +52,8 @@ class CalibrationJob(WorkerProcess[CalibrationRequest, Progress | Wanted | Calib
     """A calibration in a worker process, which also tells its progress and the drives that it wants."""
 
     def __init__(self, settings: CalibrationSettings, output: Path) -> None:
-        request = CalibrationRequest(settings, output)
-        super().__init__(run_calibration, request, CalibrationOutcome, "calibrator: the computation", talks=True)
+        what = "calibrator: the computation"
+        super().__init__(run_calibration, (settings, output), CalibrationOutcome, what, talks=True)
 
     def recorded(self) -> None:
         """Tell the worker that its drive is recorded; one that has died is told by `outcome`."""
@@ -72,7 +68,7 @@ def run_calibration(request: CalibrationRequest, node: Connection) -> Calibratio
     from slpi_ros.reports.calibration import write_files
 
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    output = request.output
+    settings, output = request
 
     def record(wanted: Request) -> Recording:
         kept = (output / wanted.name).exists()
@@ -83,7 +79,7 @@ def run_calibration(request: CalibrationRequest, node: Connection) -> Calibratio
         return replace(recording_of(output, wanted), kept=kept)
 
     try:
-        outcome = calibrate(request.settings, record, node.send)
+        outcome = calibrate(settings, record, node.send)
         write_files(output, outcome)
     except SlpiError as error:
         return CalibrationOutcome(error=str(error), exit_code=error.exit_code)

@@ -1,6 +1,7 @@
 """A path as one block of voltages for a device that plays it by its own clock, and what of it was really played."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,59 +66,51 @@ def plan(path: Trajectory, axes: Sequence[Axis], stage: StageStream | None, peri
     delays = [axis.model.chain.delay * SECOND_NS if axis.model else 0.0 for axis in moved]
     pairs = zip(columns, delays, strict=True)
     desired = np.stack([np.interp(grid + delay, times, path.positions[:, column]) for column, delay in pairs], 1)
-    saved = [(axis.stream.snapshot(), axis.stream.pace, axis.stream.coupled) for axis in moved]
-    try:
-        for axis in moved:
-            pace = RateLimiter(axis.output.limits, period, axis.voltage)
-            pace.begin(0)
-            axis.stream.pace = pace
-        return _compute(path, moved, stage, desired, period, stamp_ns)
-    finally:
-        for axis, (state, pace, coupled) in zip(moved, saved, strict=True):
-            axis.stream.restore(state)
-            axis.stream.pace, axis.stream.coupled = pace, coupled
-
-
-def _compute(
-    path: Trajectory,
-    moved: Sequence[Axis],
-    stage: StageStream | None,
-    desired: FloatArray,
-    period: float,
-    stamp_ns: int,
-) -> Block:
+    listed, step_ns, missed = desired.tolist(), round(period * SECOND_NS), ""
     names = tuple(axis.name for axis in moved)
     rows: list[list[float]] = [[axis.voltage for axis in moved]]
-    step_ns, now_ns, missed = round(period * SECOND_NS), 0, ""
 
-    def step(row: list[float]) -> list[float]:
-        nonlocal now_ns
-        now_ns += step_ns
+    def step(row: list[float]) -> bool:
+        """Add the voltages for displacements (m); return whether the slew limit holds them back."""
         if stage:
             stage.decouple(dict(zip(names, row, strict=True)))
-        return [axis.stream.move(period, y, now_ns) for axis, y in zip(moved, row, strict=True)]
+        now_ns = len(rows) * step_ns
+        rows.append([axis.stream.move(period, y, now_ns) for axis, y in zip(moved, row, strict=True)])
+        return any(axis.stream.missed and not axis.stream.held for axis in moved)
 
-    listed = desired.tolist()
-    # The way to the beginning of the path.
-    while True:
-        rows.append(step(listed[0]))
-        if not any(axis.stream.missed and not axis.stream.held for axis in moved):
-            break
-        if len(rows) > LONGEST:
-            raise RejectedError(rejection.OUT_OF_RANGE, "the beginning of the path is not reached; raise slew_limit")
-    lead_in = len(rows) - 1
-    for number, row in enumerate(listed[1:], 1):
-        rows.append(step(row))
-        if not missed:
-            late = [axis.name for axis in moved if axis.stream.missed]
+    with _tried(moved, period):
+        while step(listed[0]):
+            if len(rows) > LONGEST:
+                raise RejectedError(
+                    rejection.OUT_OF_RANGE, "the beginning of the path is not reached; raise slew_limit"
+                )
+        lead_in, behind = len(rows) - 1, False
+        for number, row in enumerate(listed[1:], 1):
+            behind = step(row)
+            late = next((axis.name for axis in moved if axis.stream.missed), None) if not missed else None
             if late:
                 held = any(axis.stream.held for axis in moved)
                 what = "out of reach, held at a voltage limit" if held else "too fast for slew_limit"
-                missed = f"axis '{late[0]}', {(number * period):.6g} s after the beginning of the path: {what}"
-    # What the limits held back at the end.
-    while any(axis.stream.missed and not axis.stream.held for axis in moved) and len(rows) <= 2 * LONGEST:
-        rows.append(step(listed[-1]))
+                missed = f"axis '{late}', {(number * period):.6g} s after the beginning of the path: {what}"
+        # What the limits held back at the end.
+        while behind and len(rows) <= 2 * LONGEST:
+            behind = step(listed[-1])
     return Block(stamp_ns, names, period, np.array(rows), lead_in, missed)
+
+
+@contextmanager
+def _tried(axes: Sequence[Axis], period: float) -> Iterator[None]:
+    """Let streams move within the limits, at a `period` (s), in the ``with`` block; after it they are as before."""
+    saved = [(axis.stream, axis.stream.snapshot(), axis.stream.pace, axis.stream.coupled) for axis in axes]
+    try:
+        for axis in axes:
+            axis.stream.pace = RateLimiter(axis.output.limits, period, axis.voltage)
+            axis.stream.pace.begin(0)
+        yield
+    finally:
+        for stream, state, pace, coupled in saved:
+            stream.restore(state)
+            stream.pace, stream.coupled = pace, coupled
 
 
 class BlockFollower(Rule):

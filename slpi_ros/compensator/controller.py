@@ -169,7 +169,7 @@ class Controller:
         wait = (deadline_ns - self._clock_ahead_ns - now_ns) * 1e-9
         if wait < 1.0:
             return "following a trajectory"
-        return f"waiting for a trajectory that {'goes on' if self.trajectory.begun else 'begins'} in {wait:.0f} s"
+        return f"waiting for a trajectory that {'goes on' if self.trajectory.moving else 'begins'} in {wait:.0f} s"
 
     # Lifecycle and models
 

@@ -2,6 +2,7 @@
 
 from array import array
 from collections.abc import Collection, Iterable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -33,25 +34,20 @@ SAME_VOLTAGES = 0.02
 class PassRecorder:
     """The readings and outputs of one pass that begins at `begin_ns`, ns on the clock of trajectories."""
 
-    # Without `learns` only the setpoints are told.
+    # Without `learns` only the setpoints are told; `held_back`: why it is not learned from, if that is known before.
     def __init__(
-        self, path: SampledPath, begin_ns: int, correction: Mapping[str, FloatArray], period: float, learns: bool = True
-    ) -> None:
-        self.path, self.begin_ns, self.period, self.learns = path, begin_ns, period, learns
-        self.held_back = ""  # why it is not learned from, if that is known before
+        self, path: SampledPath, begin_ns: int, correction: Mapping[str, FloatArray], period: float, learns: bool,
+        held_back: str = "",
+    ) -> None:  # fmt: skip
+        self.path, self.begin_ns, self.period, self.learns, self.held_back = path, begin_ns, period, learns, held_back
         self._correction, self._t = path.over_whole(correction), path.t_whole
         self.end_ns = begin_ns + round(float(self._t[-1]) * SECOND_NS)
-        self._read: dict[str, tuple[array[float], array[float]]] = {
-            name: (array("d"), array("d")) for name in path.desired
-        }
-        # Time (s), voltage (V), 1 where a voltage limit or 2 where the slew limit holds back.
-        self._output: dict[str, tuple[array[float], array[float], array[int]]] = {
-            name: (array("d"), array("d"), array("b")) for name in path.whole
-        }
+        # Time (s) and reading (m); time (s), voltage (V), 1 where a voltage limit or 2 where the slew limit holds back.
+        self._kept: dict[str, list[array[Any]]] = {name: [array(kind) for kind in "ddddb"] for name in path.whole}
 
     def read(self, name: str, reading: float, at_ns: int) -> None:
         """Take a reading (m) at `at_ns`; those of other axes and times are left alone."""
-        kept = self._read.get(name)
+        kept = self._kept.get(name)
         if kept is not None and self.begin_ns <= at_ns:
             kept[0].append((at_ns - self.begin_ns) * 1e-9)
             kept[1].append(reading)
@@ -61,25 +57,20 @@ class PassRecorder:
         at = (at_ns - self.begin_ns) * 1e-9
         place = min(max(int(at / self.path.interval + 0.5), 0), self._t.size - 1)
         for axis in axes:
-            kept = self._output.get(axis.name)
+            kept = self._kept.get(axis.name)
             if kept is not None:
-                kept[0].append(at)
-                kept[1].append(axis.voltage)
-                kept[2].append(1 if axis.held else 2 if axis.slewing else 0)
+                kept[2].append(at)
+                kept[3].append(axis.voltage)
+                kept[4].append(1 if axis.held else 2 if axis.slewing else 0)
                 axis.tracking.learned = float(self._correction[axis.name][place])
 
     def recorded(self, names: Sequence[str], at_ns: IntArray, readings: FloatArray, voltages: FloatArray) -> None:
         """Take what a device has recorded at `at_ns`, (N,): readings (m) and voltages (V), (N, names)."""
         at = (at_ns - self.begin_ns) * 1e-9
-        begun = np.flatnonzero(at >= 0.0)
-        for column, name in enumerate(names):
-            if name in self._read:
-                self._read[name][0].extend(at[begun].tolist())
-                self._read[name][1].extend(readings[begun, column].tolist())
-            if name in self._output:
-                self._output[name][0].extend(at[begun].tolist())
-                self._output[name][1].extend(voltages[begun, column].tolist())
-                self._output[name][2].extend([0] * begun.size)
+        begun, free = at >= 0.0, np.zeros(at.size, np.int8)
+        for name, reading, voltage in zip(names, readings.T, voltages.T, strict=True):
+            for kept, values in zip(self._kept.get(name, ()), (at, reading, at, voltage, free), strict=False):
+                kept.extend(values[begun].tolist())
 
     def finished(self) -> list[FinishedPass]:
         """Return what each pass says, in order; of several, not the first one, which comes from elsewhere."""
@@ -91,8 +82,7 @@ class PassRecorder:
         t, path = self._t[part], self.path
         measured, voltage, unusable, dropped = {}, {}, {}, ""
         for name in path.desired:
-            out_t, out_v, limited = (np.array(each) for each in self._output[name])
-            at, readings = (np.array(each) for each in self._read[name])
+            at, readings, out_t, out_v, limited = (np.array(each) for each in self._kept[name])
             reading = _at(t, at, readings, path.interval)
             if not out_t.size:
                 dropped = "it was not output"
@@ -145,13 +135,15 @@ class PathPasses:
         """Whether a pass of a path is followed, or awaited."""
         return bool(self._recorders)
 
-    def begin(self, path: SampledPath, start_ns: int, now_ns: int, period: float, learns: bool) -> None:
+    def begin(self, path: SampledPath | None, start_ns: int, now_ns: int, period: float, learns: bool) -> None:
         """Begin a pass of a trajectory that was accepted at `now_ns` and starts at `start_ns`, 0: at once.
 
-        Without `learns` it is followed with what is known, and tells nothing.
+        Without `learns` it is followed with what is known, and tells nothing; without `path` it only ends others.
         """
-        begin_ns = (start_ns or now_ns) + round(path.start * SECOND_NS)
         self.end(start_ns or now_ns)
+        if path is None:
+            return
+        begin_ns = (start_ns or now_ns) + round(path.start * SECOND_NS)
         learns = learns and (now_ns - begin_ns) * 1e-9 <= MOST_LATE * float(path.t_whole[-1])
         correction = self.corrections.get(path.identity, {})
         self._recorders.append(PassRecorder(path, begin_ns, correction, period, learns))
@@ -159,8 +151,8 @@ class PathPasses:
     def begin_block(self, path: SampledPath, block: Block, learns: bool) -> None:
         """Begin a pass that a device plays by its own clock, and tells by what it has recorded."""
         correction = self.corrections.get(path.identity, {})
-        recorder = PassRecorder(path, int(block.times_ns[block.lead_in]), correction, block.period, learns)
-        recorder.held_back = block.missed
+        begin_ns = int(block.times_ns[block.lead_in])
+        recorder = PassRecorder(path, begin_ns, correction, block.period, learns, block.missed)
         self._blocks = [*self._blocks, (block, recorder)][-MOST_BLOCKS:]
 
     def recorded(

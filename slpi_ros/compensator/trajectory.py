@@ -1,7 +1,7 @@
 """Trajectories: validated as a whole on arrival, then output at the output rate, linear between points."""
 
 from bisect import bisect_left
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
@@ -17,8 +17,6 @@ from slpi_ros.model.streaming import StreamingInverse, refusal
 
 # Upper limit of valid times; the sum of two times does not overflow int64.
 LATEST_NS = 2**62
-# Number of points converted to lists at once.
-BLOCK = 256
 # Points of a trajectory that are looked at before it begins, and with each sample of it: some microseconds each.
 CHECKED_FIRST, CHECKED_LATER = 500, 50
 
@@ -116,94 +114,64 @@ class Point(NamedTuple):
     between: bool = False  # interpolated, not a point of the trajectory
 
 
+@dataclass(eq=False)
 class _Track:
-    """Points (m, (N, names)) of one trajectory for all axes with the same delay, executed in order from `first`."""
+    """Points of one trajectory for all axes with the same delay, executed in order."""
 
-    # Only one track of each trajectory is `counted` by `TrajectoryExecutor.remaining`.
-    def __init__(
-        self,
-        names: tuple[str, ...],
-        positions: FloatArray,
-        deadlines_ns: IntArray,
-        first: int,
-        counted: bool,
-        begin_ns: int,
-        period_ns: int,
-        place: Callable[[str], float] | None,
-    ) -> None:
-        self.names, self.counted, self.begun = names, counted, False
-        self._period_ns, self._place = period_ns, place
-        # The last sample, from which the next point is approached; its place is not known before the begin.
-        self._since_ns = begin_ns
-        self._since: list[float] | None = None
-        # The points ``next:stop`` are pending.
-        self.next, self.stop = first, deadlines_ns.size
-        self._positions, self._deadlines_ns = positions, deadlines_ns
-        self._load()
+    names: tuple[str, ...]
+    positions: FloatArray  # m, (N, names)
+    deadlines_ns: memoryview  # access to single elements of an array is several times slower
+    next: int  # the points ``next:stop`` are pending
+    since_ns: int  # the last sample, from which the next point is approached; at first the begin
+    period_ns: int
+    place: Callable[[str], float] | None  # see `TrajectoryExecutor`
+    counted: bool  # by `TrajectoryExecutor.remaining`: only one track of each trajectory is
+    since: list[float] | None = None  # m, the last sample; None: none has been output yet
 
-    def _load(self) -> None:
-        """Convert the next block of points to lists: access to single array elements is several times slower."""
-        self._from, block = self.next, slice(self.next, self.next + BLOCK)
-        self._times, self._rows = self._deadlines_ns[block].tolist(), self._positions[block].tolist()
+    def __post_init__(self) -> None:
+        self.stop = len(self.deadlines_ns)
+        self._aim()
 
-    @property
-    def deadline_ns(self) -> int:
-        """Deadline of the next point, nanoseconds."""
-        return int(self._times[self.next - self._from])
-
-    def _pieces(self, deadline_ns: int) -> int:
-        """Return the number of output periods from the last sample to the next point; at least 1."""
-        if self._since is None and self._place is None:
-            return 1
-        return max(round((deadline_ns - self._since_ns) / self._period_ns), 1)
-
-    @property
-    def next_ns(self) -> int:
-        """Deadline of the next sample, nanoseconds."""
-        deadline = self.deadline_ns
-        return self._since_ns + (deadline - self._since_ns) // self._pieces(deadline)
+    def _aim(self) -> None:
+        """Set the deadlines (ns) of the next point and of the next sample, which is on the way to it."""
+        self.deadline_ns = self.deadlines_ns[self.next]
+        self._way_ns = self.deadline_ns - self.since_ns
+        stays = self.since is None and self.place is None
+        self._pieces = 1 if stays else max(round(self._way_ns / self.period_ns), 1)
+        self.next_ns = self.since_ns + self._way_ns // self._pieces
 
     def until(self, time_ns: int) -> int:
         """Return the index of the first pending point that is due at `time_ns` or later."""
-        at = bisect_left(self._times, time_ns, self.next - self._from)
-        if at < len(self._times):
-            return min(self._from + at, self.stop)
-        return self.next + int(np.searchsorted(self._deadlines_ns[self.next : self.stop], time_ns))
+        return bisect_left(self.deadlines_ns, time_ns, self.next, self.stop)
 
     def take(self, now_ns: int) -> tuple[Point, int]:
         """Return the latest sample that is due, and the number of earlier pending points, which are skipped."""
+        skipped = 0
         if now_ns < self.deadline_ns:
-            return self._between(now_ns), 0
-        first, self.next = self.next, self.until(now_ns + 1)
-        at, self.begun = self.next - 1 - self._from, True
-        if at < len(self._rows):
-            point = Point(self.names, self._rows[at], self._times[at])
+            point = self._between(now_ns)
         else:
-            last = self.next - 1
-            point = Point(self.names, self._positions[last].tolist(), int(self._deadlines_ns[last]))
-        if self.next < self.stop and self.next - self._from >= len(self._times):
-            self._load()
-        self._since_ns, self._since = point.deadline_ns, point.displacements
-        return point, self.next - 1 - first
+            last = self.next
+            self.next += 1
+            if self.next < self.stop and self.deadlines_ns[self.next] <= now_ns:
+                self.next = self.until(now_ns + 1)
+                skipped, last = self.next - 1 - last, self.next - 1
+            point = Point(self.names, self.positions[last].tolist(), self.deadlines_ns[last])
+        self.since_ns, self.since = point.deadline_ns, point.displacements
+        if self.next < self.stop:
+            self._aim()
+        return point, skipped
 
     def _between(self, now_ns: int) -> Point:
         """Return the latest interpolated sample that is due before the next point."""
-        deadline, since_ns = self.deadline_ns, self._since_ns
-        goal = self._rows[self.next - self._from]
-        since = self._since
+        since = self.since
         if since is None:
-            assert self._place
-            since = [self._place(name) for name in self.names]
-        pieces = self._pieces(deadline)
-        at_ns = (
-            since_ns + (deadline - since_ns) * max((now_ns - since_ns) * pieces // (deadline - since_ns), 1) // pieces
-        )
-        share = (at_ns - since_ns) / (deadline - since_ns)
-        point = Point(
-            self.names, [y + share * (end - y) for y, end in zip(since, goal, strict=True)], at_ns, between=True
-        )
-        self._since_ns, self._since, self.begun = at_ns, point.displacements, True
-        return point
+            assert self.place
+            since = [self.place(name) for name in self.names]
+        piece = max((now_ns - self.since_ns) * self._pieces // self._way_ns, 1)
+        ahead_ns = self._way_ns * piece // self._pieces
+        share, goal = ahead_ns / self._way_ns, self.positions[self.next].tolist()
+        places = [y + share * (end - y) for y, end in zip(since, goal, strict=True)]
+        return Point(self.names, places, self.since_ns + ahead_ns, between=True)
 
 
 class TrajectoryExecutor:
@@ -219,7 +187,7 @@ class TrajectoryExecutor:
         self.crowded = 0  # of these, closer together than the output period
         self.too_fast = ""  # the first point that the slew limit will make late; "" if none is known
         self._tracks: list[_Track] = []
-        self._checks: list[PaceCheck] = []
+        self._ahead: Iterator[str] = iter(())  # see `_look_ahead`
 
     @property
     def on(self) -> bool:
@@ -232,30 +200,15 @@ class TrajectoryExecutor:
         return sum(track.stop - track.next for track in self._tracks if track.counted)
 
     @property
-    def names(self) -> set[str]:
-        """Names of the axes with pending points."""
-        return {name for track in self._tracks for name in track.names}
-
-    @property
     def next_deadline_ns(self) -> int | None:
         """Deadline of the next sample, nanoseconds; None if no point is pending."""
         tracks = self._tracks
         return tracks[0].next_ns if len(tracks) == 1 else min((track.next_ns for track in tracks), default=None)
 
     @property
-    def tracks(self) -> int:
-        """Number of tracks: each pending trajectory has one for every different delay of its axes."""
-        return len(self._tracks)
-
-    @property
     def moving(self) -> set[str]:
         """Names of the axes that are on their way along a trajectory."""
-        return {name for track in self._tracks if track.begun for name in track.names}
-
-    @property
-    def begun(self) -> bool:
-        """Whether a pending trajectory has already output a sample."""
-        return any(track.begun for track in self._tracks)
+        return {name for track in self._tracks if track.since for name in track.names}
 
     def start(
         self,
@@ -280,28 +233,25 @@ class TrajectoryExecutor:
             positions = useful.positions if len(columns) == len(useful.names) else useful.positions[:, columns]
             names = tuple(useful.names[i] for i in columns)
             begin_ns = max(trajectory.start_ns - shift, now_ns) if trajectory.start_ns else now_ns
-            period_ns = round(self.period * SECOND_NS)
-            tracks.append(_Track(names, positions, deadlines, first, not tracks, begin_ns, period_ns, self._place))
+            period_ns, counted = round(self.period * SECOND_NS), not tracks
+            tracks.append(_Track(names, positions, deadlines.data, first, begin_ns, period_ns, self._place, counted))
         begin_ns = min(track.next_ns for track in tracks)
         kept = self._tracks if trajectory.start_ns else []
         for track in kept:
             track.stop = track.until(begin_ns) if track.next_ns < begin_ns else track.next
         self._tracks = [*(track for track in kept if track.next < track.stop), *tracks]
-        self.too_fast, wait = "", (trajectory.start_ns - now_ns) * 1e-9 if trajectory.start_ns else 0.0
-        self._checks = [
-            PaceCheck(name, streams[name], trajectory, wait, self.period) for name in trajectory.names if streams
-        ]
-        self.look_ahead(CHECKED_FIRST)
+        wait = (trajectory.start_ns - now_ns) * 1e-9 if trajectory.start_ns else 0.0
+        self.too_fast = ""
+        self._ahead = _look_ahead(trajectory, streams, wait, self.period) if streams else iter(())
+        self.look_ahead()
 
-    def look_ahead(self, points: int = CHECKED_LATER) -> None:
+    def look_ahead(self) -> None:
         """Look at the next points: whether the slew limit will make one late (`too_fast`)."""
-        for check in self._checks:
-            self.too_fast = self.too_fast or check.look(points)
-        self._checks = [check for check in self._checks if not check.done]
+        self.too_fast = self.too_fast or next(self._ahead, "")
 
     def cancel(self) -> None:
         """Discard all pending points."""
-        self._tracks, self._checks = [], []
+        self._tracks, self._ahead = [], iter(())
 
     def due(self, now_ns: int) -> Point | None:
         """Return the latest point that is due and not yet returned, or None; to be called until it returns None."""
@@ -322,35 +272,37 @@ class TrajectoryExecutor:
         return point
 
 
-class PaceCheck:
-    """Find the first point that the slew limit makes late by more than a `period` (s), `wait` (s) before the start."""
+def _look_ahead(
+    trajectory: Trajectory, streams: Mapping[str, StreamingInverse], wait: float, period: float
+) -> Iterator[str]:
+    """Look at the next points of each axis with every step, and yield "" until one is late, which is told at last.
 
-    def __init__(self, axis: str, stream: StreamingInverse, trajectory: Trajectory, wait: float, period: float) -> None:
-        self._axis, self._period = axis, period
-        self._positions = trajectory.positions[:, trajectory.names.index(axis)]
-        self._times, self._cut, self._next = trajectory.time_from_start_ns, trajectory.cut, 0
-        self._stream, limits = stream.copy(), stream.limits
-        self._slew, self._voltage, self._last_ns = limits.slew, stream.voltage, -round(max(wait, 0.0) * SECOND_NS)
-        self._stream.pace = RateLimiter(Limits(limits.lower, limits.upper), period, stream.voltage)
-        self.done = not np.isfinite(self._slew)  # all points looked at, or a late one found
-
-    def look(self, points: int) -> str:
-        """Look at the next points; return what is said of the first late one, "" if there is none among them."""
-        end = min(self._next + points, len(self._times))
-        times, positions = self._times[self._next : end].tolist(), self._positions[self._next : end].tolist()
-        for number, (time_ns, y) in enumerate(zip(times, positions, strict=True), self._next):
-            dt = (time_ns - self._last_ns) * 1e-9
-            self._last_ns = time_ns
-            goal = self._stream.move(dt, y, time_ns)
-            way = self._slew * dt
-            self._voltage += min(max(goal - self._voltage, -way), way)
-            late = abs(goal - self._voltage) / self._slew
-            if late > 2.0 * self._period:
-                self.done = True
-                return (
-                    f"too fast for slew_limit {self._slew:g} V/s: axis '{self._axis}', point {self._cut + number} at "
-                    f"{time_ns / SECOND_NS:.6g} s will be late by {late:.3g} s"
-                )
-        self._next = end
-        self.done = self.done or end == len(self._times)
-        return ""
+    Late is what the slew limit makes late by more than two periods (s); the trajectory begins after `wait` (s).
+    """
+    limits = {name: streams[name].limits for name in trajectory.names if np.isfinite(streams[name].limits.slew)}
+    copies = {name: streams[name].copy() for name in limits}
+    for name, stream in copies.items():
+        stream.pace = RateLimiter(Limits(limits[name].lower, limits[name].upper), period, stream.voltage)
+    voltages = {name: stream.voltage for name, stream in copies.items()}
+    begin_ns, first, points = -round(max(wait, 0.0) * SECOND_NS), 0, CHECKED_FIRST
+    while copies and first < len(trajectory):
+        part = slice(first, first + points)
+        times = trajectory.time_from_start_ns[part].tolist()
+        for name, stream in copies.items():
+            last_ns, slew, voltage = begin_ns, limits[name].slew, voltages[name]
+            places = trajectory.positions[part, trajectory.names.index(name)].tolist()
+            for number, (time_ns, y) in enumerate(zip(times, places, strict=True), first):
+                dt = (time_ns - last_ns) * 1e-9
+                last_ns = time_ns
+                goal = stream.move(dt, y, time_ns)
+                voltage += min(max(goal - voltage, -slew * dt), slew * dt)
+                late = abs(goal - voltage) / slew
+                if late > 2.0 * period:
+                    yield (
+                        f"too fast for slew_limit {slew:g} V/s: axis '{name}', point {trajectory.cut + number} at "
+                        f"{time_ns / SECOND_NS:.6g} s will be late by {late:.3g} s"
+                    )
+                    return
+            voltages[name] = voltage
+        yield ""
+        begin_ns, first, points = times[-1], part.stop, CHECKED_LATER

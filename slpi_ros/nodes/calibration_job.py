@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import threading
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -32,13 +33,8 @@ class Wanted:
     desired: FloatArray  # m, (N, axes), or (N, 0) if there is none
 
 
-@dataclass(frozen=True)
-class CalibrationRequest:
-    """What the worker needs; `output` is the folder of bags and results, `node` the connection to the node."""
-
-    settings: CalibrationSettings
-    output: str
-    node: Connection
+# Settings, and the folder of bags and results.
+CalibrationRequest = tuple[CalibrationSettings, Path]
 
 
 @dataclass(frozen=True)
@@ -52,45 +48,27 @@ class CalibrationOutcome:
     exit_code: int = 1
 
 
-class CalibrationJob:
-    """A calibration in a worker process; `output` is the folder of bags and results."""
+class CalibrationJob(WorkerProcess[CalibrationRequest, Progress | Wanted | CalibrationOutcome]):
+    """A calibration in a worker process, which also tells its progress and the drives that it wants."""
 
     def __init__(self, settings: CalibrationSettings, output: Path) -> None:
-        self._own, worker = multiprocessing.get_context("spawn").Pipe()
-        request = CalibrationRequest(settings, str(output), worker)
-        self._process = WorkerProcess(run_calibration, request, CalibrationOutcome, "calibrator: the computation")
-        worker.close()
-
-    def said(self) -> Progress | Wanted | None:
-        """Return what the worker has said, if anything: its progress, or a drive that it wants; does not block."""
-        try:
-            said: Progress | Wanted | None = self._own.recv() if self._own.poll() else None
-        except (EOFError, OSError):
-            return None
-        return said
+        what = "calibrator: the computation"
+        super().__init__(run_calibration, (settings, output), CalibrationOutcome, what, talks=True)
 
     def recorded(self) -> None:
-        """Tell the worker that its drive is recorded."""
-        self._own.send(None)
-
-    def outcome(self) -> CalibrationOutcome | None:
-        """Return the outcome, or None while the worker is running; does not block."""
-        return self._process.outcome()
-
-    def end(self) -> None:
-        """End the worker at once, wherever it is."""
-        self._process.end()
-        self._own.close()
+        """Tell the worker that its drive is recorded; one that has died is told by `outcome`."""
+        with suppress(BrokenPipeError, ConnectionResetError):
+            self.connection.send(None)
 
 
-def run_calibration(request: CalibrationRequest) -> CalibrationOutcome:
+def run_calibration(request: CalibrationRequest, node: Connection) -> CalibrationOutcome:
     """Calibrate a stage; entry point of the worker process."""
     # Imported here because they load slowly.
     from slpi_ros.model.document import format_model
     from slpi_ros.reports.calibration import write_files
 
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    node, output = request.node, Path(request.output)
+    settings, output = request
 
     def record(wanted: Request) -> Recording:
         kept = (output / wanted.name).exists()
@@ -101,7 +79,7 @@ def run_calibration(request: CalibrationRequest) -> CalibrationOutcome:
         return replace(recording_of(output, wanted), kept=kept)
 
     try:
-        outcome = calibrate(request.settings, record, node.send)
+        outcome = calibrate(settings, record, node.send)
         write_files(output, outcome)
     except SlpiError as error:
         return CalibrationOutcome(error=str(error), exit_code=error.exit_code)

@@ -231,15 +231,15 @@ class Calibrator(Node):
         worker = self._worker
         if worker is None or self._outcome is not None:
             return
-        said = worker.said()
+        said = worker.outcome()
         if isinstance(said, Progress):
             self._progress = said
             error = "" if said.error is None else f", mean error {said.error * 1e6:.4f} µm"
             self.get_logger().info(f"step {said.step}: {said.doing}; {said.seconds_left:.0f} s of drives left{error}")
-        elif said is not None:
+        elif isinstance(said, Wanted):
             self._begin_job(said)
         else:
-            self._outcome = worker.outcome()
+            self._outcome = said
 
     def _begin_job(self, wanted: Wanted) -> None:
         self._job, self._stepped = _Job(wanted, self._output, self._settings.axes), time.monotonic()

@@ -9,13 +9,14 @@ import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from slpi_ros.compensator.persistence import model_id
-from slpi_ros.errors import DependencyError, ModelError, RecordError, SlpiError, dependencies_needed, shown
+from slpi_ros.errors import ModelError, RecordError, SlpiError, dependencies_needed, shown
 from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.input_limits import TOPIC_MODEL_CHARACTERS
 from slpi_ros.io.record import Record
@@ -26,27 +27,45 @@ Request = TypeVar("Request")
 Outcome = TypeVar("Outcome")
 
 
-class WorkerProcess(Generic[Request, Outcome]):
-    """Run a function of a module in a worker process and return its outcome without blocking."""
+class Worker:
+    """A process that runs a function of a module with the other end of `connection`; `end` kills it at once."""
 
-    # `outcome` is a dataclass of plain values, created with only `error` set, which names `what` was done, if the
-    # process ends without a result.
-    def __init__(
-        self, work: Callable[[Request], Outcome], request: Request, outcome: Callable[..., Outcome], what: str
-    ) -> None:
-        self.request, self._begun = request, time.monotonic()
-        self._make, self._what = outcome, what
+    def __init__(self, run: Callable[..., None], *given: Any) -> None:
         # Not fork: the middleware threads do not survive a fork.
         context = multiprocessing.get_context("spawn")
-        self._receiver, sender = context.Pipe(duplex=False)
-        self._process = context.Process(target=_run, args=(sender, work, request), daemon=True)
-        # Ctrl-C reaches the whole process group; this process ends the worker itself.
-        blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
-        try:
-            self._process.start()
-        finally:
-            signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-        sender.close()
+        self.connection, other = context.Pipe()
+        self.process = context.Process(target=run, args=(other, *given), daemon=True)
+        with normal_scheduling():
+            # Begun with the first process, it would unblock the signal for that one.
+            resource_tracker.ensure_running()
+            # Ctrl-C reaches the whole process group; this process ends the worker itself.
+            blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            try:
+                self.process.start()
+            finally:
+                signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+        other.close()
+
+    def end(self) -> None:
+        """Kill the process and wait until it has ended."""
+        self.process.kill()
+        self.process.join()
+        self.connection.close()
+
+
+class WorkerProcess(Worker, Generic[Request, Outcome]):
+    """Run a function of a module in a worker process and return its outcome without blocking.
+
+    The class `outcome` is created with only `error` set if the process ends without a result, which then names `what`
+    was done. Work that `talks` is given its connection, too: `outcome` also returns what it says before its outcome.
+    """
+
+    def __init__(
+        self, work: Callable[..., Any], request: Request, outcome: type, what: str, talks: bool = False
+    ) -> None:
+        super().__init__(_run, work, request, outcome, talks)
+        self.request, self._begun = request, time.monotonic()
+        self._make, self._what = outcome, what
 
     @property
     def seconds(self) -> float:
@@ -55,36 +74,31 @@ class WorkerProcess(Generic[Request, Outcome]):
 
     def outcome(self) -> Outcome | None:
         """Return the outcome, or None while the process is running; does not block."""
-        if not self._receiver.poll():
+        if not self.connection.poll():
             return None
         try:
-            outcome = self._make(**json.loads(self._receiver.recv_bytes()))
-        except EOFError:
-            self._process.join()
-            outcome = self._make(
-                error=f"{self._what} ended with exit code {self._process.exitcode} and no result; check the "
+            said: Outcome = self.connection.recv()
+        except (EOFError, OSError):
+            self.process.join()
+            said = self._make(
+                error=f"{self._what} ended with exit code {self.process.exitcode} and no result; check the "
                 "available memory, or use a shorter record"
             )
-        self.end()
-        return outcome
-
-    def end(self) -> None:
-        """Kill the worker process and wait until it has ended."""
-        self._process.kill()
-        self._process.join()
-        self._receiver.close()
+        if isinstance(said, self._make):
+            self.end()
+        return said
 
 
-def _run(sender: Connection, work: Callable[[Any], Any], request: Any) -> None:
+def _run(connection: Connection, work: Callable[..., Any], request: Any, outcome: type, talks: bool) -> None:
     """Entry point of the process: send the outcome of a request."""
     # Like a line of the node's log, without the line of code that warns.
     warnings.formatwarning = lambda message, *_: f"[WARN] {shown(str(message))}\n"
     try:
         with dependencies_needed():
-            outcome = asdict(work(request))
-    except DependencyError as error:
-        outcome = {"error": str(error)}
-    sender.send_bytes(json.dumps(outcome).encode())
+            said = work(request, connection) if talks else work(request)
+    except SlpiError as error:
+        said = outcome(error=str(error))
+    connection.send(said)
 
 
 @dataclass(frozen=True)
@@ -254,10 +268,7 @@ class CheckOutcome:
 
 def check(request: tuple[str, str]) -> CheckOutcome:
     """Validate a model document; `request` holds its text, and its name in messages."""
-    try:
-        return CheckOutcome(fingerprint=model_id(parse_model(*request)))
-    except SlpiError as error:
-        return CheckOutcome(error=str(error))
+    return CheckOutcome(model_id(parse_model(*request)))
 
 
 class Reading:
@@ -284,9 +295,9 @@ class Reading:
             model = parse_model(self._document, self._source)
             return model, model_id(model)
         try:
-            with normal_scheduling():
-                request = self._document, self._source
-                checking = WorkerProcess(check, request, CheckOutcome, f"{self._source}: the check of the model")
+            checking: WorkerProcess[tuple[str, str], CheckOutcome] = WorkerProcess(
+                check, (self._document, self._source), CheckOutcome, f"{self._source}: the check of the model"
+            )
         except OSError as error:
             raise ModelError(f"{self._source}: cannot be checked: {error.strerror}; send it again") from None
         try:

@@ -1,11 +1,10 @@
 """What the compensator learns of paths that come again: in a process of its own, so that no command waits for it."""
 
-import multiprocessing
 import os
-import signal
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
@@ -20,29 +19,13 @@ from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.learning.repeated_paths import AxisProgress, Learned, RepeatedPaths, SampledPath
 from slpi_ros.model.document import format_model, parse_model
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.nodes.jobs import normal_scheduling
+from slpi_ros.nodes.jobs import Worker
 
 OFF, ON = "off", "on"
 # How much less urgent the process is than the node.
 NICENESS = 10
 # Requests that wait for the process; passes that come with more are not learned from.
 MOST_WAITING = 4
-
-
-@dataclass(frozen=True)
-class Opening:
-    """Request to go on from the files that begin with `prefix`, with a model document and limits (m; None: usual)."""
-
-    document: str
-    prefix: str
-    limit: Mapping[str, float] | None
-
-
-@dataclass(frozen=True)
-class Forgetting:
-    """Request to forget everything, and to remove the files that begin with `prefix`."""
-
-    prefix: str
 
 
 @dataclass(frozen=True)
@@ -54,30 +37,36 @@ class Answer:
     forgotten: int | None = None
 
 
-Request = Opening | tuple[PassRecorder, ...] | Forgetting
+class Paths:
+    """What the process knows; each method answers a request."""
+
+    def __init__(self) -> None:
+        self._paths, self._again = RepeatedPaths(StageModel({})), ComingAgain()
+
+    def open(self, document: str, prefix: str, limit: Mapping[str, float] | None) -> Answer:
+        """Go on from the files that begin with `prefix`, with a model document and limits (m; None: usual)."""
+        before, self._paths = self._paths, RepeatedPaths(parse_model(document, "the model"), prefix, limit)
+        return Answer([*self._paths.take_over(before), *self._paths.load()])
+
+    def learn(self, passes: Sequence[PassRecorder]) -> Answer:
+        """Learn from passes."""
+        learned = self._paths.learn(*self._again.of(passes, self._paths.known))
+        return Answer(learned, self._again.dropped)
+
+    def forget(self, prefix: str) -> Answer:
+        """Forget everything, and remove the files that begin with `prefix`."""
+        self._paths.prefix, self._again = prefix, ComingAgain()
+        return Answer(forgotten=self._paths.forget())
 
 
 def serve(connection: Connection) -> None:
-    """Answer requests until the other end is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """Answer requests, each a method of `Paths` and what it is given, until the other end is closed."""
     os.nice(NICENESS)
-    paths, again = RepeatedPaths(StageModel({})), ComingAgain()
-    while True:
-        try:
-            request: Request = connection.recv()
-        except (EOFError, OSError):
-            return
-        if isinstance(request, Opening):
-            before = paths
-            paths = RepeatedPaths(parse_model(request.document, "the model"), request.prefix, request.limit)
-            answer = Answer([*paths.take_over(before), *paths.load()])
-        elif isinstance(request, tuple):
-            learned = paths.learn(*again.of(request, paths.known))
-            answer = Answer(learned, again.dropped)
-        else:
-            paths.prefix, again = request.prefix, ComingAgain()
-            answer = Answer(forgotten=paths.forget())
-        connection.send(answer)
+    paths = Paths()
+    with suppress(EOFError, OSError):
+        while True:
+            method, *given = connection.recv()
+            connection.send(method(paths, *given))
 
 
 class PathLearning:
@@ -98,11 +87,14 @@ class PathLearning:
         self._model: StageModel | None = None
         self._opened = False
         self._thread = ThreadPoolExecutor(1, "learning")
-        self._process: Any = None
-        self._connection: Connection | None = None
-        self._answers: deque[tuple[int, Answer]] = deque()
+        self._worker: Worker | None = None
+        self._asked: deque[tuple[int, Future[Answer]]] = deque()  # in an era
         self._era = 0  # answers to requests of an earlier one are void
-        self.waiting = 0  # requests that the process has not answered yet
+
+    @property
+    def waiting(self) -> int:
+        """Number of requests whose answer has not been taken yet."""
+        return len(self._asked)
 
     def use(self, mode: str, limit: Mapping[str, float] | None, period: float) -> None:
         """Learn (`on`), follow what was learned (`hold`) or neither (`off`).
@@ -115,7 +107,7 @@ class PathLearning:
             self.passes.forget()
             self.progress = {}
             self._opened, self._era = False, self._era + 1
-            if self._process is not None:
+            if self._worker:
                 self._thread.submit(self._stop)
         elif changed or not self._opened:
             self._open()
@@ -134,8 +126,8 @@ class PathLearning:
         if self._model is None:
             return
         self._era, self._opened = self._era + 1, True
-        model, limit = self._model, self.limit
-        self._ask(lambda: Opening(format_model(model), self._prefix, limit))
+        model, prefix, limit = self._model, self._prefix, self.limit
+        self._ask(lambda: (Paths.open, format_model(model), prefix, limit))
 
     def corrected(
         self, names: Sequence[str], times: ArrayLike, positions: ArrayLike, *, as_block: bool = False
@@ -161,10 +153,7 @@ class PathLearning:
 
     def begin(self, path: SampledPath | None, start_ns: int, clock_ns: int) -> None:
         """Take notice of a trajectory that was accepted; None: it is not learned."""
-        if path is None:
-            self.passes.end(start_ns or clock_ns)
-        else:
-            self.passes.begin(path, start_ns, clock_ns, self._controller.trajectory.period, self.mode == ON)
+        self.passes.begin(path, start_ns, clock_ns, self._controller.trajectory.period, self.mode == ON)
 
     def begin_block(self, path: SampledPath | None, block: Block) -> None:
         """Take notice of a block that a device will play and record; no path: it is not learned."""
@@ -173,9 +162,9 @@ class PathLearning:
 
     def poll(self, clock_ns: int) -> None:
         """Take what has been learned, and have passes learned that have ended."""
-        while self._answers:
-            era, answer = self._answers.popleft()
-            self.waiting -= 1
+        while self._asked and self._asked[0][1].done():
+            era, coming = self._asked.popleft()
+            answer = coming.result()
             self.dropped = answer.dropped or self.dropped
             if answer.forgotten is not None:
                 self.dropped = ""
@@ -193,53 +182,44 @@ class PathLearning:
         if clock_ns:
             if self.passes.on and self._controller.mode is not OperatingMode.TRAJECTORY:
                 self.passes.end(clock_ns)
-            done = tuple(self.passes.take(clock_ns))
+            done = self.passes.take(clock_ns)
             if done and self.waiting < MOST_WAITING:
-                self._ask(lambda: done)
+                self._ask(lambda: (Paths.learn, done))
 
     def forget(self) -> None:
         """Begin anew from the desired paths; `on_forgotten` is called when the files are removed."""
         self.passes.forget()
         self.progress = {}
         self._era += 1
-        self._ask(lambda: Forgetting(self._prefix))
+        self._ask(lambda: (Paths.forget, self._prefix))
 
     def close(self) -> None:
         """End the process."""
         self._thread.shutdown(wait=False, cancel_futures=True)
         self._stop()
 
-    def _ask(self, request: Callable[[], Request]) -> None:
-        self.waiting += 1
-        self._thread.submit(self._answer, self._era, request)
+    def _stop(self) -> None:
+        worker = self._worker
+        if worker:
+            worker.process.kill()
 
-    def _answer(self, era: int, request: Callable[[], Request]) -> None:
+    def _ask(self, request: Callable[[], tuple[Any, ...]]) -> None:
+        self._asked.append((self._era, self._thread.submit(self._answer, request)))
+
+    def _answer(self, request: Callable[[], tuple[Any, ...]]) -> Answer:
         """Send a request to the process, which is started if there is none; wait for its answer."""
         try:
             wanted = request()
-            if self._process is None or not self._process.is_alive():
-                if isinstance(wanted, tuple):
+            if self._worker is None or not self._worker.process.is_alive():
+                if wanted[0] is Paths.learn:
                     # A new process has to be given the model first.
                     raise EOFError
-                self._start()
-            assert self._connection
-            self._connection.send(wanted)
-            answer = self._connection.recv()
+                self._worker = Worker(serve)
+            self._worker.connection.send(wanted)
+            answer: Answer = self._worker.connection.recv()
         except (EOFError, OSError):
-            self._process, self._opened = None, False
-            answer = Answer(
+            self._worker, self._opened = None, False
+            return Answer(
                 [Learned("", {}, {}, ("the process that learns has ended: learning goes on from the files",))]
             )
-        self._answers.append((era, answer))
-
-    def _stop(self) -> None:
-        if self._process is not None:
-            self._process.kill()
-
-    def _start(self) -> None:
-        context = multiprocessing.get_context("spawn")
-        self._connection, other = context.Pipe()
-        self._process = context.Process(target=serve, args=(other,), daemon=True)
-        with normal_scheduling():
-            self._process.start()
-        other.close()
+        return answer

@@ -299,7 +299,7 @@ def test_a_trajectory_that_is_too_fast_is_told_before_it_begins():
     quick, slow = controller(slew=100.0), controller(slew=100.0)
     for made, step in ((quick, 400 * MS), (slow, 700 * MS)):
         made.follow(["x"], np.arange(1, 4) * step, y[:, None], 0, START, START)
-        assert not made.trajectory.begun and made.voltages[0] == 0.0
+        assert not made.trajectory.moving and made.voltages[0] == 0.0
     assert slow.trajectory.too_fast == ""
     # 60 V in 0.4 s at 100 V/s.
     assert (

@@ -544,7 +544,7 @@ def test_an_endless_diagnosis_blocks_nothing_and_leaves_nothing(bag, humming_bag
 def test_a_worker_that_dies_is_an_error_not_a_hang(bag):
     request = FitRequest((bag,), "stage_state", "pi", None, None, "")
     job = WorkerProcess(fit, request, FitOutcome, "the identification")
-    job._process.kill()
+    job.process.kill()
     deadline = time.monotonic() + PATIENCE_S
     while (outcome := job.outcome()) is None:
         assert time.monotonic() < deadline

@@ -1,6 +1,9 @@
 """Reading model documents: large ones in a process of their own, the newest first."""
 
 import json
+import signal
+import subprocess
+import sys
 import threading
 from dataclasses import replace
 
@@ -88,6 +91,22 @@ def test_a_reading_that_is_cancelled_comes_to_nothing(nothing_checked_here):
     thread.join()
     assert results == [None]
     assert reading.read() is None
+
+
+FIRST_WORKER = """
+import time
+from slpi_ros.nodes.jobs import CheckOutcome, WorkerProcess
+worker = WorkerProcess(time.sleep, 60.0, CheckOutcome, "sleep")
+print(open(f"/proc/{worker.process.pid}/status").read())
+worker.end()
+"""
+
+
+def test_the_first_worker_too_leaves_ctrl_c_to_its_node():
+    """Python's own helper process, begun with the first one, lets SIGINT through."""
+    said = subprocess.run([sys.executable, "-c", FIRST_WORKER], capture_output=True, text=True, check=True).stdout
+    (blocked,) = (line.split()[1] for line in said.splitlines() if line.startswith("SigBlk:"))
+    assert int(blocked, 16) & 1 << (signal.SIGINT - 1)
 
 
 def test_the_newest_document_wins_and_commands_go_on():

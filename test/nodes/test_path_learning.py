@@ -63,8 +63,8 @@ def test_what_is_learned_comes_back_and_survives_the_death_of_the_process(tmp_pa
         errors = learning.passes_of(10)
         assert errors[-1] < 0.2 * errors[1]
         assert learning.progress["x"].passes == 10 and not learning.remarks
-        learning._process.kill()
-        learning._process.join()
+        learning._worker.process.kill()
+        learning._worker.process.join()
         # It is begun again, from the file.
         assert max(learning.passes_of(3)) < 0.3 * errors[1]
         assert learning.progress["x"].passes > 10

@@ -208,9 +208,11 @@ class ResidualWindow:
         self._residuals: deque[float] = deque(maxlen=WINDOW)
         self._before = self._expected = expected
 
-    def expect(self, displacement: float) -> None:
-        """Store the model displacement (m) for the voltage applied from now on."""
-        self._before, self._expected = self._expected, displacement
+    def expect(self, displacement: float, anew: bool = True) -> None:
+        """Store the model displacement (m) for the voltage applied from now on; `anew`: of another sample."""
+        if anew:
+            self._before = self._expected
+        self._expected = displacement
 
     def measure(self, displacement: float) -> None:
         """Store the residual of a measured displacement (m)."""

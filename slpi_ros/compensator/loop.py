@@ -219,7 +219,7 @@ class Loop:
         self.due_ns = self._corrected_ns + 2 * period_ns
         if self._output.in_motion:
             self.due_ns = min(self.due_ns, now_ns + period_ns)
-        self._expect(applied.drive(v, dt), now_ns)
+        self._expect(applied.drive(v, dt), now_ns, anew=not early_ns)
         return v
 
     def follow(self, voltage: float, dt: float, now_ns: int) -> None:
@@ -233,12 +233,12 @@ class Loop:
         if self._setpoint:
             self._setpoint.hold(y, now_ns)
 
-    def _expect(self, displacement: float, now_ns: int) -> None:
+    def _expect(self, displacement: float, now_ns: int, anew: bool = True) -> None:
         """Set the displacement of the model (m) with which readings are compared from `now_ns` (ns) on."""
         if self._expected:
             self._expected.hold(displacement, now_ns)
         else:
-            self._residuals.expect(displacement)
+            self._residuals.expect(displacement, anew)
 
     def _forget_residuals(self) -> None:
         """Discard the residuals, as the model or the state of its hysteresis has changed."""

@@ -129,3 +129,20 @@ def test_feedback_is_frozen_in_a_ramp_and_goes_on_without_a_bump():
     stage.run(0.5, 100.0, lambda t: 4.1e-6)
     assert np.abs(np.diff([v for _, v in stage.given][1:])).max() < 0.2
     assert stage.memory.displacement + 1e-7 == pytest.approx(4.1e-6, abs=1e-10)
+
+
+def test_a_late_answer_between_two_set_points_is_no_residual_while_feedback_goes_on():
+    """The stage is where it was before the set point for 5 ms more; corrections in between are no other sample."""
+    stage = Stage(PidGains(0.0, 1.0))
+    stage.run(0.2, 100.0)
+    for k in range(600):
+        y = 5e-6 + 1e-8 * (k % 200)
+        stage.send(y)
+        before = stage.memory.displacement - 1e-8 * (k % 200 > 0)
+        for ms in range(10):
+            stage.now_ns += MS
+            stage.made.measure(["x"], [before if ms < 5 else stage.memory.displacement], stage.now_ns)
+            if stage.made.advance(stage.now_ns, stage.now_ns):
+                stage.publish()
+    drift = stage.made.axes[0].loop.drift
+    assert drift.samples == 500 and drift.rms < 1e-10

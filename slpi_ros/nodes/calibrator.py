@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,7 @@ from slpi_ros.io.desired import read_path
 from slpi_ros.io.messages import JointStateEncoder
 from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.calibration_job import PATH, STATE, CalibrationJob, CalibrationOutcome, Wanted
-from slpi_ros.nodes.common import LATCHED, WARN, Diagnostics, Health, request_stop, serve
+from slpi_ros.nodes.common import LATCHED, WARN, Diagnostics, Health, request_stop, serve, steady_timer
 from slpi_ros.nodes.guarded_drive import DELIVERY, GuardedDrive
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, limits_of, validated
 from slpi_ros.reports.calibration import PAGE
@@ -128,21 +129,18 @@ class _Job:
 
 
 def settings_of(values: Values) -> CalibrationSettings:
-    """Return the settings of a calibration from the parameters of the node; UsageError if a value is not valid."""
-    checked, axes = validated(DECLARATIONS, values), tuple(values["axes"])
-    if not checked["output"]:
+    """Return the settings of a calibration from the validated parameters of the node; UsageError if one is missing."""
+    if not values["output"]:
         raise UsageError("calibrator: no output; name the folder with --ros-args -p output:=FOLDER")
-    limits = limits_of(checked)
+    limits, axes = limits_of(values), tuple(values["axes"])
     return CalibrationSettings(
-        axes=axes,
-        limits=limits,
-        rest=checked["rest_voltage"] or tuple(each.clip(0.0) for each in limits),
-        rate=checked["rate"],
-        budget=checked["budget"] * len(axes),
-        target=checked["target"] * 1e-6,
-        times_repeatability=checked["times_repeatability"],
-        seed=checked["seed"],
-        path=_path_of(checked["desired_path"], axes, checked["rate"]) if checked["desired_path"] else {},
+        axes,
+        limits,
+        rest=values["rest_voltage"] or tuple(each.clip(0.0) for each in limits),
+        budget=values["budget"] * len(axes),
+        target=values["target"] * 1e-6,
+        path=_path_of(values["desired_path"], axes, values["rate"]) if values["desired_path"] else {},
+        **{name: values[name] for name in ("rate", "times_repeatability", "seed")},
     )
 
 
@@ -182,13 +180,11 @@ class Calibrator(Node):
 
     def __init__(self) -> None:
         super().__init__("calibrator")
-        values = Parameters(self, DECLARATIONS, lambda values: dict(values)).settings
+        values = Parameters(self, DECLARATIONS, partial(validated, DECLARATIONS)).settings
         self._settings = settings = settings_of(values)
-        self._output, self._patience = Path(values["output"]).absolute(), float(values["patience"])
+        self._output, self._patience = Path(values["output"]).absolute(), values["patience"]
         _prepare(self._output, resume=values["resume"])
-        self._guard = GuardedDrive(
-            self, settings.axes, settings.limits, settings.rate, values["state_timeout"], on_state=self._on_state
-        )
+        self._guard = GuardedDrive(self, values, on_state=self._on_state)
         self._job: _Job | None = None
         self._worker: CalibrationJob | None = None
         self._failure: SlpiError | None = None
@@ -196,19 +192,19 @@ class Calibrator(Node):
         self._progress: Progress | None = None
         self._returning = self._paused = False
         self._begun = self._stepped = self._moved = time.monotonic()
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._drive_clock = self.get_clock() if self.get_parameter("use_sim_time").value else steady
+        simulated = self.get_parameter("use_sim_time").value
+        self._drive_clock = self.get_clock() if simulated else Clock(clock_type=ClockType.STEADY_TIME)
         self._step_ns = 0
         self._models = self.create_publisher(String, "stage_model", LATCHED)
         self._diagnostics = Diagnostics(self, "calibrator")
         for name, answer in (("start", self._on_start), ("pause", self._on_pause), ("stop", self._on_stop)):
             serve(self, f"~/{name}", answer)
-        self._waiting = bool(values["autostart"])
+        self._waiting = values["autostart"]
         period = 1.0 / settings.rate
         # A simulated clock drives a simulated stage; the watch goes on if it stops.
         self.create_timer(period, self._step, clock=self._drive_clock)
-        self.create_timer(period, self._watch, clock=steady)
-        self.create_timer(REPORT_PERIOD, self._report, clock=steady)
+        steady_timer(self, period, self._watch)
+        steady_timer(self, REPORT_PERIOD, self._report)
 
     def destroy_node(self) -> None:
         """Return to rest, keep what was recorded, then destroy the node; Interrupted if a signal ended the run."""
@@ -402,11 +398,10 @@ def _prepare(output: Path, *, resume: bool) -> None:
     """Make the folder; move unfinished bags aside if the calibration is resumed, else require that it is empty."""
     make_folder(output)
     try:
-        held = sorted(output.iterdir())
-        if held and not resume:
+        if not resume and any(output.iterdir()):
             raise UsageError(f"{output}: not empty; choose another folder, or go on with resume:=true")
-        for path in held:
-            if path.is_dir() and path == partial_path(path.with_name(path.name[1:].removesuffix(".partial"))):
+        for path in sorted(output.glob(partial_path(output / "*").name)):
+            if path.is_dir():
                 path.rename(_free(path.with_name(f"killed_{path.name[1:].removesuffix('.partial')}")))
     except OSError as error:
         raise RecordError(f"{output}: {error.strerror}; choose another folder") from None

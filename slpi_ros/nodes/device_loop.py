@@ -138,14 +138,10 @@ class DeviceLoop:
                 self._serve(self._requests.popleft())
             if not self._link.lost:
                 self._cycle(self._now_ns())
+            elif self._link.due:
+                self._open(arm=self._settings.rearm)
         except DeviceError as error:
             self._lose(error)
-            return
-        if self._link.lost and self._link.due:
-            try:
-                self._open(arm=self._settings.rearm)
-            except DeviceError as error:
-                self._link.lose(error)
 
     def _cycle(self, now_ns: int) -> None:
         """Write what is due, read, and look at what was read. Raises DeviceError."""
@@ -202,7 +198,7 @@ class DeviceLoop:
 
     def _lose(self, error: DeviceError) -> None:
         self.blocks.drop(str(error))
-        self.counts.losses += 1
+        self.counts.losses += not self._link.lost
         self._link.lose(error)
 
     def _serve(self, what: str) -> None:

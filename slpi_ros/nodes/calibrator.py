@@ -2,9 +2,9 @@
 
 import math
 import time
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rclpy.clock import Clock, ClockType
@@ -77,10 +77,13 @@ class Interrupted(SlpiError):
 
 
 class _Job:
-    """A drive on its way, and its bag in a folder: what is commanded at its present time, and the readings of it."""
+    """A drive on its way, and its bag in a folder: what is commanded at its present time, and the readings of it.
 
-    def __init__(self, wanted: Wanted, output: Path, axes: Sequence[str]) -> None:
-        self.wanted, self._bag = wanted, BagWriter(output / wanted.name, topic=f"/{STATE}")
+    `fail` is called with the reason if the bag cannot be written.
+    """
+
+    def __init__(self, wanted: Wanted, output: Path, axes: Sequence[str], fail: Callable[[SlpiError], None]) -> None:
+        self.wanted, self._bag, self._fail = wanted, BagWriter(output / wanted.name, topic=f"/{STATE}"), fail
         self._encoder = JointStateEncoder(axes, "")
         if wanted.desired.size:
             self._bag.add_topic(PATH)
@@ -108,14 +111,14 @@ class _Job:
             self.write(stamp, self._encoder.encode(stamp, desired, voltages), PATH)
 
     def write(self, stamp: int, message: bytes, topic: str) -> None:
-        """Record a message; RecordError if that fails."""
+        """Record a message."""
         try:
             self._bag.write(stamp, message, topic)
         except RecordError as error:
-            raise RecordError(f"{error}; its unfinished files are in {self._bag.partial}") from error
+            self._fail(RecordError(f"{error}; its unfinished files are in {self._bag.partial}"))
 
     def close(self, *, interrupted: bool) -> None:
-        """Complete the bag, and set it aside if the drive was interrupted; RecordError if that fails or it is empty."""
+        """Complete the bag, and set it aside if the drive was interrupted; it fails if it is empty."""
         path = self._bag.path
         try:
             if not self._bag.message_count:
@@ -124,8 +127,8 @@ class _Job:
             self._bag.close()
             if interrupted:
                 path.rename(_free(path.with_name(f"interrupted_{path.name}")))
-        except OSError as error:
-            raise RecordError(str(error)) from error
+        except (OSError, RecordError) as error:
+            self._fail(RecordError(str(error)))
 
 
 def settings_of(values: Values) -> CalibrationSettings:
@@ -180,7 +183,7 @@ class Calibrator(Node):
 
     def __init__(self) -> None:
         super().__init__("calibrator")
-        values = Parameters(self, DECLARATIONS, partial(validated, DECLARATIONS)).settings
+        values = validated(DECLARATIONS, Parameters(self, DECLARATIONS, dict[str, Any]).settings)
         self._settings = settings = settings_of(values)
         self._output, self._patience = Path(values["output"]).absolute(), values["patience"]
         _prepare(self._output, resume=values["resume"])
@@ -233,13 +236,10 @@ class Calibrator(Node):
             error = "" if said.error is None else f", mean error {said.error * 1e6:.4f} µm"
             self.get_logger().info(f"step {said.step}: {said.doing}; {said.seconds_left:.0f} s of drives left{error}")
         elif said is not None:
-            self._begin_job(said)
+            self._job, self._stepped = _Job(said, self._output, self._settings.axes, self._fail), time.monotonic()
+            self._guard.begin()
         else:
             self._outcome = worker.outcome()
-
-    def _begin_job(self, wanted: Wanted) -> None:
-        self._job, self._stepped = _Job(wanted, self._output, self._settings.axes), time.monotonic()
-        self._guard.begin()
 
     # Drives
 
@@ -257,10 +257,7 @@ class Calibrator(Node):
         self._guard.move(job.goals())
         if self._paused:
             return
-        try:
-            job.keep_desired(self.get_clock().now().nanoseconds, self._guard.voltages)
-        except RecordError as error:
-            self._fail(error)
+        job.keep_desired(self.get_clock().now().nanoseconds, self._guard.voltages)
         if job.done:
             self._end_job()
 
@@ -270,10 +267,7 @@ class Calibrator(Node):
         if job is None:
             return
         self._guard.end()
-        try:
-            job.close(interrupted=self._failure is not None)
-        except RecordError as error:
-            self._fail(error)
+        job.close(interrupted=self._failure is not None)
         if self._failure is None and self._worker is not None:
             self._worker.recorded()
 
@@ -329,10 +323,7 @@ class Calibrator(Node):
     def _on_state(self, data: bytes, clock_ns: int) -> None:
         """Record a state if a drive is on its way."""
         if self._job is not None and not self._returning:
-            try:
-                self._job.write(clock_ns, data, f"/{STATE}")
-            except RecordError as error:
-                self._fail(error)
+            self._job.write(clock_ns, data, f"/{STATE}")
 
     # Ends
 
@@ -363,12 +354,11 @@ class Calibrator(Node):
             self._diagnostics.report(Health(((WARN, str(self._failure)),), "", {}, hardware_id))
             return
         doing = "waiting for the stage" if self._waiting or self._worker is not None else "waiting for ~/start"
-        state = "paused" if self._paused else "computing" if self._job is None else "driving"
         values: Mapping[str, object] = {"state": "waiting"}
         if progress:
             doing = progress.doing
             values = {
-                "state": state,
+                "state": "paused" if self._paused else "computing" if self._job is None else "driving",
                 "step": progress.step,
                 "seconds_left": f"{progress.seconds_left:.1f}",
                 "mean_error_um": "" if progress.error is None else f"{progress.error * 1e6:.5f}",

@@ -69,14 +69,9 @@ class ExciterSettings:
     def drawn(self, found: Sequence[float]) -> Drive:
         """Return the excitation, from and to rest_voltage, or the voltages (V) at which the amplifier was found."""
         rest = self.values["rest_voltage"] or [limits.clip(v) for limits, v in zip(self.limits, found, strict=True)]
-        given = {name: self.values[name] for name in ("axes", "duration", "rate", "seed", "drive")}
-        return excite(
-            voltage_min=[each.lower for each in self.limits],
-            voltage_max=[each.upper for each in self.limits],
-            slew_limit=[SLEW_USED * each.slew if each.slew < math.inf else 0.0 for each in self.limits],
-            start=rest,
-            **given,
-        )
+        same = ("axes", "voltage_min", "voltage_max", "duration", "rate", "seed", "drive")
+        slew_limit = [SLEW_USED * each.slew if each.slew < math.inf else 0.0 for each in self.limits]
+        return excite(slew_limit=slew_limit, start=rest, **{name: self.values[name] for name in same})
 
 
 # Period of the watch and of messages while it waits, seconds.

@@ -39,7 +39,7 @@ class GuardedDrive:
     def __init__(self, node: Node, values: Values, on_state: OnState | None = None, publisher: Any = None) -> None:
         self._node, self._axes, self._on_valid = node, tuple(values["axes"]), on_state
         self.publisher: Any = publisher or node.create_publisher(Float64MultiArray, COMMAND, COMMANDS)
-        self._subscription = None
+        self.heard = False  # whether anybody publishes, or has published, states
         self.reported: list[float] | None = None  # V, last valid
         self.hardware_id = ""
         self.prepare(values)
@@ -64,19 +64,13 @@ class GuardedDrive:
         """Whether voltages may be published."""
         return self._goals is not None
 
-    @property
-    def heard(self) -> bool:
-        """Whether anybody publishes, or has published, states."""
-        return self._subscription is not None
-
     def listen(self) -> None:
         """Subscribe to the states with the reliability that their publishers offer; again and again until there are."""
-        if self._subscription is not None:
-            return
-        publishers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(STATE))
-        if publishers:
+        topic = self._node.resolve_topic_name(STATE)
+        if not self.heard and (publishers := self._node.get_publishers_info_by_topic(topic)):
             qos = QoSProfile(depth=1000, reliability=reliability_of(publishers))
-            self._subscription = self._node.create_subscription(JointState, STATE, self._on_state, qos, raw=True)
+            self._node.create_subscription(JointState, STATE, self._on_state, qos, raw=True)
+            self.heard = True
 
     # Before a drive
 
@@ -99,7 +93,7 @@ class GuardedDrive:
     def lacking(self) -> str:
         """Return what is missing before a drive may start, with what to do; "" if nothing is."""
         topic = self._node.resolve_topic_name(STATE)
-        if self._subscription is None:
+        if not self.heard:
             return f"no publisher of {topic}; start the driver of the stage, or remap its topic"
         if not self.publisher.get_subscription_count():
             return f"no subscriber of {self.publisher.topic_name}; start the driver of the stage, or remap its topic"

@@ -128,10 +128,7 @@ class BlockPlayer:
         """Do the next piece of what the device plays itself; DeviceError if it fails."""
         self._now_ns = now_ns
         if self._life is not None:
-            try:
-                next(self._life)
-            except StopIteration:
-                self._life = None
+            next(self._life, None)
 
     def _play(self, device: Device, period: float) -> Generator[None]:
         """Load, play and read it, in pieces of one wait of the device each."""
@@ -147,7 +144,7 @@ class BlockPlayer:
                 else:
                     self.finish(BlockPhase.ENDED)
         yield
-        self.recording = yield from device.recorded()
+        self.recording, self._life = (yield from device.recorded()), None
 
     def _tell_playing(self) -> None:
         self.begun_ns, self._asked_ns = self.begun_ns or self._now_ns, self._now_ns

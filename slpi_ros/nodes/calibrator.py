@@ -2,8 +2,9 @@
 
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rclpy.clock import Clock, ClockType
@@ -22,7 +23,7 @@ from slpi_ros.io.desired import read_path
 from slpi_ros.io.messages import JointStateEncoder
 from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.calibration_job import PATH, STATE, CalibrationJob, CalibrationOutcome, Wanted
-from slpi_ros.nodes.common import LATCHED, WARN, Diagnostics, Health, request_stop, serve
+from slpi_ros.nodes.common import LATCHED, WARN, Diagnostics, Health, request_stop, serve, steady_timer
 from slpi_ros.nodes.guarded_drive import DELIVERY, GuardedDrive
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, limits_of, validated
 from slpi_ros.reports.calibration import PAGE
@@ -76,10 +77,13 @@ class Interrupted(SlpiError):
 
 
 class _Job:
-    """A drive on its way, and its bag in a folder: what is commanded at its present time, and the readings of it."""
+    """A drive on its way, and its bag in a folder: what is commanded at its present time, and the readings of it.
 
-    def __init__(self, wanted: Wanted, output: Path, axes: Sequence[str]) -> None:
-        self.wanted, self._bag = wanted, BagWriter(output / wanted.name, topic=f"/{STATE}")
+    `fail` is called with the reason if the bag cannot be written.
+    """
+
+    def __init__(self, wanted: Wanted, output: Path, axes: Sequence[str], fail: Callable[[SlpiError], None]) -> None:
+        self.wanted, self._bag, self._fail = wanted, BagWriter(output / wanted.name, topic=f"/{STATE}"), fail
         self._encoder = JointStateEncoder(axes, "")
         if wanted.desired.size:
             self._bag.add_topic(PATH)
@@ -107,14 +111,14 @@ class _Job:
             self.write(stamp, self._encoder.encode(stamp, desired, voltages), PATH)
 
     def write(self, stamp: int, message: bytes, topic: str) -> None:
-        """Record a message; RecordError if that fails."""
+        """Record a message."""
         try:
             self._bag.write(stamp, message, topic)
         except RecordError as error:
-            raise RecordError(f"{error}; its unfinished files are in {self._bag.partial}") from error
+            self._fail(RecordError(f"{error}; its unfinished files are in {self._bag.partial}"))
 
     def close(self, *, interrupted: bool) -> None:
-        """Complete the bag, and set it aside if the drive was interrupted; RecordError if that fails or it is empty."""
+        """Complete the bag, and set it aside if the drive was interrupted; it fails if it is empty."""
         path = self._bag.path
         try:
             if not self._bag.message_count:
@@ -123,26 +127,23 @@ class _Job:
             self._bag.close()
             if interrupted:
                 path.rename(_free(path.with_name(f"interrupted_{path.name}")))
-        except OSError as error:
-            raise RecordError(str(error)) from error
+        except (OSError, RecordError) as error:
+            self._fail(RecordError(str(error)))
 
 
 def settings_of(values: Values) -> CalibrationSettings:
-    """Return the settings of a calibration from the parameters of the node; UsageError if a value is not valid."""
-    checked, axes = validated(DECLARATIONS, values), tuple(values["axes"])
-    if not checked["output"]:
+    """Return the settings of a calibration from the validated parameters of the node; UsageError if one is missing."""
+    if not values["output"]:
         raise UsageError("calibrator: no output; name the folder with --ros-args -p output:=FOLDER")
-    limits = limits_of(checked)
+    limits, axes = limits_of(values), tuple(values["axes"])
     return CalibrationSettings(
-        axes=axes,
-        limits=limits,
-        rest=checked["rest_voltage"] or tuple(each.clip(0.0) for each in limits),
-        rate=checked["rate"],
-        budget=checked["budget"] * len(axes),
-        target=checked["target"] * 1e-6,
-        times_repeatability=checked["times_repeatability"],
-        seed=checked["seed"],
-        path=_path_of(checked["desired_path"], axes, checked["rate"]) if checked["desired_path"] else {},
+        axes,
+        limits,
+        rest=values["rest_voltage"] or tuple(each.clip(0.0) for each in limits),
+        budget=values["budget"] * len(axes),
+        target=values["target"] * 1e-6,
+        path=_path_of(values["desired_path"], axes, values["rate"]) if values["desired_path"] else {},
+        **{name: values[name] for name in ("rate", "times_repeatability", "seed")},
     )
 
 
@@ -182,13 +183,11 @@ class Calibrator(Node):
 
     def __init__(self) -> None:
         super().__init__("calibrator")
-        values = Parameters(self, DECLARATIONS, lambda values: dict(values)).settings
+        values = validated(DECLARATIONS, Parameters(self, DECLARATIONS, dict[str, Any]).settings)
         self._settings = settings = settings_of(values)
-        self._output, self._patience = Path(values["output"]).absolute(), float(values["patience"])
+        self._output, self._patience = Path(values["output"]).absolute(), values["patience"]
         _prepare(self._output, resume=values["resume"])
-        self._guard = GuardedDrive(
-            self, settings.axes, settings.limits, settings.rate, values["state_timeout"], on_state=self._on_state
-        )
+        self._guard = GuardedDrive(self, values, on_state=self._on_state)
         self._job: _Job | None = None
         self._worker: CalibrationJob | None = None
         self._failure: SlpiError | None = None
@@ -196,19 +195,19 @@ class Calibrator(Node):
         self._progress: Progress | None = None
         self._returning = self._paused = False
         self._begun = self._stepped = self._moved = time.monotonic()
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self._drive_clock = self.get_clock() if self.get_parameter("use_sim_time").value else steady
+        simulated = self.get_parameter("use_sim_time").value
+        self._drive_clock = self.get_clock() if simulated else Clock(clock_type=ClockType.STEADY_TIME)
         self._step_ns = 0
         self._models = self.create_publisher(String, "stage_model", LATCHED)
         self._diagnostics = Diagnostics(self, "calibrator")
         for name, answer in (("start", self._on_start), ("pause", self._on_pause), ("stop", self._on_stop)):
             serve(self, f"~/{name}", answer)
-        self._waiting = bool(values["autostart"])
+        self._waiting = values["autostart"]
         period = 1.0 / settings.rate
         # A simulated clock drives a simulated stage; the watch goes on if it stops.
         self.create_timer(period, self._step, clock=self._drive_clock)
-        self.create_timer(period, self._watch, clock=steady)
-        self.create_timer(REPORT_PERIOD, self._report, clock=steady)
+        steady_timer(self, period, self._watch)
+        steady_timer(self, REPORT_PERIOD, self._report)
 
     def destroy_node(self) -> None:
         """Return to rest, keep what was recorded, then destroy the node; Interrupted if a signal ended the run."""
@@ -237,13 +236,10 @@ class Calibrator(Node):
             error = "" if said.error is None else f", mean error {said.error * 1e6:.4f} µm"
             self.get_logger().info(f"step {said.step}: {said.doing}; {said.seconds_left:.0f} s of drives left{error}")
         elif isinstance(said, Wanted):
-            self._begin_job(said)
+            self._job, self._stepped = _Job(said, self._output, self._settings.axes, self._fail), time.monotonic()
+            self._guard.begin()
         else:
             self._outcome = said
-
-    def _begin_job(self, wanted: Wanted) -> None:
-        self._job, self._stepped = _Job(wanted, self._output, self._settings.axes), time.monotonic()
-        self._guard.begin()
 
     # Drives
 
@@ -261,10 +257,7 @@ class Calibrator(Node):
         self._guard.move(job.goals())
         if self._paused:
             return
-        try:
-            job.keep_desired(self.get_clock().now().nanoseconds, self._guard.voltages)
-        except RecordError as error:
-            self._fail(error)
+        job.keep_desired(self.get_clock().now().nanoseconds, self._guard.voltages)
         if job.done:
             self._end_job()
 
@@ -274,10 +267,7 @@ class Calibrator(Node):
         if job is None:
             return
         self._guard.end()
-        try:
-            job.close(interrupted=self._failure is not None)
-        except RecordError as error:
-            self._fail(error)
+        job.close(interrupted=self._failure is not None)
         if self._failure is None and self._worker is not None:
             self._worker.recorded()
 
@@ -333,10 +323,7 @@ class Calibrator(Node):
     def _on_state(self, data: bytes, clock_ns: int) -> None:
         """Record a state if a drive is on its way."""
         if self._job is not None and not self._returning:
-            try:
-                self._job.write(clock_ns, data, f"/{STATE}")
-            except RecordError as error:
-                self._fail(error)
+            self._job.write(clock_ns, data, f"/{STATE}")
 
     # Ends
 
@@ -367,12 +354,11 @@ class Calibrator(Node):
             self._diagnostics.report(Health(((WARN, str(self._failure)),), "", {}, hardware_id))
             return
         doing = "waiting for the stage" if self._waiting or self._worker is not None else "waiting for ~/start"
-        state = "paused" if self._paused else "computing" if self._job is None else "driving"
         values: Mapping[str, object] = {"state": "waiting"}
         if progress:
             doing = progress.doing
             values = {
-                "state": state,
+                "state": "paused" if self._paused else "computing" if self._job is None else "driving",
                 "step": progress.step,
                 "seconds_left": f"{progress.seconds_left:.1f}",
                 "mean_error_um": "" if progress.error is None else f"{progress.error * 1e6:.5f}",
@@ -402,11 +388,10 @@ def _prepare(output: Path, *, resume: bool) -> None:
     """Make the folder; move unfinished bags aside if the calibration is resumed, else require that it is empty."""
     make_folder(output)
     try:
-        held = sorted(output.iterdir())
-        if held and not resume:
+        if not resume and any(output.iterdir()):
             raise UsageError(f"{output}: not empty; choose another folder, or go on with resume:=true")
-        for path in held:
-            if path.is_dir() and path == partial_path(path.with_name(path.name[1:].removesuffix(".partial"))):
+        for path in sorted(output.glob(partial_path(output / "*").name)):
+            if path.is_dir():
                 path.rename(_free(path.with_name(f"killed_{path.name[1:].removesuffix('.partial')}")))
     except OSError as error:
         raise RecordError(f"{output}: {error.strerror}; choose another folder") from None

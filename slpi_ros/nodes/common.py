@@ -7,6 +7,7 @@ import sys
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
@@ -44,14 +45,18 @@ DIAGNOSTICS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
 KEPT_BYTES, _M_TRIM_THRESHOLD, _M_MMAP_MAX = 2**29, -1, -4
 
 
+def nanoseconds(time: Any) -> int:
+    """Return a time or a duration of a message in ns."""
+    return int(time.sec * SECOND_NS + time.nanosec)
+
+
 def as_rclpy_reads(data: bytes) -> tuple[int, Sequence[str], Sequence[float]]:
     """Return stamp (ns), names and positions of a serialized JointState; no names if it is not valid."""
     try:
         message = deserialize_message(data, JointState)
     except RuntimeError:
         return 0, (), ()
-    stamp = message.header.stamp
-    return stamp.sec * SECOND_NS + stamp.nanosec, message.name, message.position
+    return nanoseconds(message.header.stamp), message.name, message.position
 
 
 def read_trajectory(data: bytes, field: str = "positions") -> TrajectoryArrays:
@@ -65,11 +70,10 @@ def read_trajectory(data: bytes, field: str = "positions") -> TrajectoryArrays:
         message = deserialize_message(data, JointTrajectory)
     except RuntimeError:
         return TrajectoryArrays(0, (), np.zeros(1, np.int64), np.zeros((1, 0)))
-    stamp, points = message.header.stamp, message.points
-    times = [point.time_from_start.sec * SECOND_NS + point.time_from_start.nanosec for point in points]
-    rows = [list(getattr(point, field)) for point in points]
+    times = [nanoseconds(point.time_from_start) for point in message.points]
+    rows = [list(getattr(point, field)) for point in message.points]
     values = np.array(rows, float) if len(set(map(len, rows))) == 1 else np.zeros((len(rows), 0))
-    start_ns = stamp.sec * SECOND_NS + stamp.nanosec
+    start_ns = nanoseconds(message.header.stamp)
     return TrajectoryArrays(start_ns, tuple(message.joint_names), np.array(times, np.int64), values)
 
 
@@ -116,20 +120,17 @@ def refuse_impossible_transitions(node: LifecycleNode) -> None:
     # Otherwise rclpy ends the process, for instance after two calls of ``ros2 lifecycle set NODE configure``.
     for service in node.services:
         if service.srv_type is ChangeState:
-            service.callback = _refusing(node, service.callback)
+            service.callback = partial(_change_state, node, service.callback)
 
 
-def _refusing(node: LifecycleNode, change_state: Any) -> Any:
-    def on_request(request: Any, response: Any) -> Any:
-        try:
-            return change_state(request, response)
-        except RuntimeError as error:
-            wanted = request.transition.label or request.transition.id
-            node.get_logger().warning(f"no transition '{wanted}' from the present state: {error}")
-            response.success = False
-            return response
-
-    return on_request
+def _change_state(node: LifecycleNode, change: Any, request: Any, response: Any) -> Any:
+    try:
+        return change(request, response)
+    except RuntimeError as error:
+        wanted = request.transition.label or request.transition.id
+        node.get_logger().warning(f"no transition '{wanted}' from the present state: {error}")
+        response.success = False
+        return response
 
 
 def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
@@ -161,11 +162,10 @@ def message_class(topic: str, msgtype: str) -> Any:
 
 def publishers_beside(node: Node, topic: str) -> list[str]:
     """Return the full names of the other nodes that publish a topic, given with its full name."""
-    own = node.get_name(), node.get_namespace()
-    names = [(each.node_name, each.node_namespace) for each in node.get_publishers_info_by_topic(topic)]
-    if own in names:
-        names.remove(own)
-    return sorted(full_name(namespace, name) for name, namespace in names)
+    names = sorted(full_name(each.node_namespace, each.node_name) for each in node.get_publishers_info_by_topic(topic))
+    with suppress(ValueError):
+        names.remove(node.get_fully_qualified_name())
+    return names
 
 
 def ask_for_priority(node: Node, priority: int) -> None:

@@ -7,9 +7,8 @@ from enum import Enum
 
 import numpy as np
 
-from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.drivers.base import Block, Device, Reading, Recording
-from slpi_ros.io.messages import SECOND_NS
+from slpi_ros.io.messages import SECOND_NS, TrajectoryArrays
 from slpi_ros.model.limits import volts
 from slpi_ros.nodes.device_writer import LoopSettings, Writer
 
@@ -40,19 +39,9 @@ class BlockState:
     reason: str = ""
 
 
-@dataclass(frozen=True)
-class BlockRequest:
-    """A block as it arrived: `voltages` of some axes at `times_ns` since its start; without samples: stop."""
-
-    stamp_ns: int
-    names: tuple[str, ...]
-    times_ns: IntArray  # (N,)
-    voltages: FloatArray  # V, (N, names)
-
-
-def refusal(request: BlockRequest, settings: LoopSettings, present: Sequence[float]) -> str:
-    """Return why a block may not be played from the `present` voltages (V), "" if it may."""
-    axes, times, values = settings.axes, request.times_ns, request.voltages
+def refusal(request: TrajectoryArrays, settings: LoopSettings, present: Sequence[float]) -> str:
+    """Return why a block of voltages (V) may not be played from the `present` ones (V), "" if it may."""
+    axes, times, values = settings.axes, request.time_from_start_ns, request.values
     if not request.names or len(set(request.names)) != len(request.names):
         return f"it names the axes {', '.join(request.names) or 'not'}; name each once"
     if unknown := [name for name in request.names if name not in axes]:
@@ -94,24 +83,19 @@ class BlockPlayer:
     """
 
     def __init__(
-        self, request: BlockRequest, axes: Sequence[str], present: tuple[float, ...], states: deque[BlockState]
+        self, request: TrajectoryArrays, axes: Sequence[str], present: tuple[float, ...], states: deque[BlockState]
     ) -> None:
-        self.stamp_ns, self._times_ns, self._states = request.stamp_ns, request.times_ns, states
+        self.stamp_ns, self._times_ns, self._states = request.start_ns, request.time_from_start_ns, states
         self.voltages = np.tile(np.array(present), (self._times_ns.size, 1))
         for column, name in enumerate(request.names):
-            self.voltages[:, axes.index(name)] = request.voltages[:, column]
+            self.voltages[:, axes.index(name)] = request.values[:, column]
         self.count, self.last = len(self.voltages), tuple(self.voltages[-1].tolist())
         self.by_device = self.ended = False
         self.sample = self.begun_ns = 0  # 0: not yet
         self.recording: Recording | None = None
-        self._readings: list[Reading] = []
+        self.readings: list[Reading] = []  # while it is streamed: its record
         self._life: Generator[None] | None = None  # what the device still has to do
         self._asked_ns = self._now_ns = 0
-
-    @property
-    def playing_by_device(self) -> bool:
-        """Whether the device moves the voltages by itself now."""
-        return self.by_device and self.begun_ns != 0 and not self.ended
 
     @property
     def done(self) -> bool:
@@ -144,10 +128,7 @@ class BlockPlayer:
         """Do the next piece of what the device plays itself; DeviceError if it fails."""
         self._now_ns = now_ns
         if self._life is not None:
-            try:
-                next(self._life)
-            except StopIteration:
-                self._life = None
+            next(self._life, None)
 
     def _play(self, device: Device, period: float) -> Generator[None]:
         """Load, play and read it, in pieces of one wait of the device each."""
@@ -163,7 +144,7 @@ class BlockPlayer:
                 else:
                     self.finish(BlockPhase.ENDED)
         yield
-        self.recording = yield from device.recorded()
+        self.recording, self._life = (yield from device.recorded()), None
 
     def _tell_playing(self) -> None:
         self.begun_ns, self._asked_ns = self.begun_ns or self._now_ns, self._now_ns
@@ -180,22 +161,15 @@ class BlockPlayer:
             self._tell_playing()
         return tuple(float(np.interp(elapsed, self._times_ns, column)) for column in self.voltages.T)
 
-    def note(self, reading: Reading) -> None:
-        """Keep a reading of a block that is streamed, as its record."""
-        if self.begun_ns and not self.by_device and not self.ended:
-            self._readings.append(reading)
-
     def finish(self, phase: BlockPhase, reason: str = "") -> None:
         """End it; what the device recorded is read by the next turns."""
         self.ended = True
         if not self.begun_ns:
             self._life = None
-        if self._readings:
-            times = np.array([each.read_ns - self.begun_ns for each in self._readings]) / SECOND_NS
-            positions, voltages = (
-                np.array([getattr(each, name) for each in self._readings]) for name in ("positions", "voltages")
-            )
-            self.recording = Recording(times, positions, voltages)
+        if self.readings:
+            times = np.array([each.read_ns - self.begun_ns for each in self.readings]) / SECOND_NS
+            positions = np.array([each.positions for each in self.readings])
+            self.recording = Recording(times, positions, np.array([each.voltages for each in self.readings]))
         self.tell(phase, reason)
 
 
@@ -209,11 +183,11 @@ class Blocks:
         self.states: deque[BlockState] = deque()
         self.recorded: deque[BlockPlayer] = deque()  # that ended with a recording
         self._device, self._settings, self._writer = device, settings, writer
-        self._submitted: deque[BlockRequest] = deque()
+        self._submitted: deque[TrajectoryArrays] = deque()
         self._block: BlockPlayer | None = None
 
-    def submit(self, request: BlockRequest) -> None:
-        """Take a block to play, or an empty one to stop; what becomes of it appears in `states`."""
+    def submit(self, request: TrajectoryArrays) -> None:
+        """Take a block of voltages (V) to play, or an empty one to stop; what becomes of it appears in `states`."""
         self._submitted.append(request)
 
     @property
@@ -229,19 +203,19 @@ class Blocks:
     @property
     def by_device(self) -> bool:
         """Whether the device moves the voltages by itself now."""
-        return self._block is not None and self._block.playing_by_device
+        block = self._block
+        return block is not None and block.by_device and block.begun_ns != 0 and not block.ended
 
     def serve(self, held: str, now_ns: int) -> None:
         """Begin with a block that has come, or say why not, as with the reason `held`; let the device play its own."""
         while self._submitted:
             request = self._submitted.popleft()
-            if not request.times_ns.size:
+            if not request.time_from_start_ns.size:
                 self.stop("by an empty trajectory")
                 continue
-            reason = held or (BUSY if self._block else "")
-            reason = reason or refusal(request, self._settings, self._writer.written)
+            reason = held or (BUSY if self._block else refusal(request, self._settings, self._writer.written))
             if reason:
-                self.states.append(BlockState(BlockPhase.REFUSED, request.stamp_ns, 0, reason))
+                self.states.append(BlockState(BlockPhase.REFUSED, request.start_ns, 0, reason))
                 continue
             self._block = block = BlockPlayer(request, self._settings.axes, self._writer.written, self.states)
             self._writer.goal = None
@@ -261,9 +235,10 @@ class Blocks:
         block = self._block
         if block is None:
             return
-        block.note(reading)
-        if not (block.by_device or block.ended) and block.sample >= block.count and self._writer.at(block.last):
-            block.finish(BlockPhase.ENDED)
+        if block.begun_ns and not block.by_device and not block.ended:
+            block.readings.append(reading)
+            if block.sample >= block.count and self._writer.at(block.last):
+                block.finish(BlockPhase.ENDED)
         self._put_away(block)
 
     def stop(self, reason: str) -> str:
@@ -271,7 +246,7 @@ class Blocks:
         block = self._block
         if block is None or block.ended:
             return ""
-        if block.playing_by_device:
+        if self.by_device:
             block.sample = self._device.halt()
             self._writer.start(self._device.read().voltages)
         block.finish(BlockPhase.STOPPED, reason)

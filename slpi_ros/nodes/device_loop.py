@@ -13,12 +13,14 @@ from slpi_ros.drivers.base import Device, DeviceError, Found, Reading
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import volts
 from slpi_ros.nodes.device_block import BUSY, Blocks
-from slpi_ros.nodes.device_link import Link, State, Status
+from slpi_ros.nodes.device_link import State, Status, opened
 from slpi_ros.nodes.device_pace import Pace
 from slpi_ros.nodes.device_writer import LoopSettings, Writer
 
 # Longest wait of the thread for a command, seconds.
 LONGEST_SLEEP = 0.05
+# Time between two attempts to reach a device.
+RETRY_NS = SECOND_NS // 4
 
 
 @dataclass
@@ -44,8 +46,8 @@ class DeviceLoop:
     Cycles fall in step with commands that come steadily, so that these are not written up to a cycle late (`Pace`).
 
     The first opening raises its error out of `run`. Nothing is written before the first command, and the first voltage
-    starts from the one that the device had. After an error the device is opened anew until it succeeds (`Link`); then
-    it is only read until `arm`, or armed at once with ``rearm``. Voltages pass a `Writer`, blocks are those of
+    starts from the one that the device had. After an error the device is opened anew until it succeeds; then it is
+    only read until `arm`, or armed at once with ``rearm``. Voltages pass a `Writer`, blocks are those of
     `Blocks`. A finding of the writer's monitor holds the device.
     """
 
@@ -61,7 +63,8 @@ class DeviceLoop:
         self.latest: Reading | None = None
         self.answers: deque[tuple[str, bool, str]] = deque()  # request, whether it succeeded, text
         self._device, self._settings, self._on_reading, self._now_ns = device, settings, on_reading, now_ns
-        self._link, self._writer = Link(device, settings, now_ns), Writer(settings)
+        self.status, self._retry_ns = Status(State.OPENING), 0
+        self._writer = Writer(settings)
         self.blocks = Blocks(device, settings, self._writer)
         # Free once a command has come that no cycle has taken; an event would take several times longer.
         self._commanded = threading.Lock()
@@ -71,18 +74,13 @@ class DeviceLoop:
 
     # Called by other threads: none of them waits
 
-    @property
-    def status(self) -> Status:
-        """State of the device."""
-        return self._link.status
-
     def command(self, voltages: Sequence[float]) -> str:
         """Take the voltages (V) of all axes as the goal; return why they are rejected, or ""."""
         axes = self._settings.axes
         status = self.status
         if len(voltages) != len(axes) or not all(map(math.isfinite, voltages)):
             reason = f"{list(voltages)[:8]}: send one finite voltage for each of the axes {', '.join(axes)}"
-        elif status.state is not State.ARMED or self._ending:
+        elif not status.armed or self._ending:
             reason = status.reason or "the device is not open yet"
         elif self.blocks.busy:
             reason = BUSY
@@ -117,7 +115,7 @@ class DeviceLoop:
             while not self._ending or self._returning():
                 self._wait(pace)
                 began_ns = self._now_ns()
-                if not self._link.lost:
+                if not self.status.lost:
                     self.timing.note(pace.due_ns, began_ns)
                 pace.begin(began_ns)
                 self.turn()
@@ -136,28 +134,24 @@ class DeviceLoop:
         try:
             while self._requests:
                 self._serve(self._requests.popleft())
-            if not self._link.lost:
+            if not self.status.lost:
                 self._cycle(self._now_ns())
+            elif self._now_ns() >= self._retry_ns:
+                self._open(arm=self._settings.rearm)
         except DeviceError as error:
             self._lose(error)
-            return
-        if self._link.lost and self._link.due:
-            try:
-                self._open(arm=self._settings.rearm)
-            except DeviceError as error:
-                self._link.lose(error)
 
     def _cycle(self, now_ns: int) -> None:
         """Write what is due, read, and look at what was read. Raises DeviceError."""
-        armed = self._link.armed and not self._ending
+        armed = self.status.armed and not self._ending
         self.blocks.serve("" if armed else self.status.reason or "the driver ends", now_ns)
         reading = self._device.exchange(self._next(now_ns))
         self.counts.cycles += 1
         self.latest = reading
         self._on_reading(reading)
         self.blocks.note(reading)
-        if self._link.armed and not self.blocks.by_device and (found := self._writer.compare(reading, now_ns)):
-            self._link.set(State.HELD, f"{self._device.name}: {found}")
+        if self.status.armed and not self.blocks.by_device and (found := self._writer.compare(reading, now_ns)):
+            self._set(State.HELD, f"{self._device.name}: {found}")
 
     def _next(self, now_ns: int) -> tuple[float, ...] | None:
         """Return the voltages (V) to write; None if they are those that were written last, or nothing is commanded."""
@@ -166,7 +160,7 @@ class DeviceLoop:
             goal = self._settings.rest
         elif self.blocks.moving:
             goal = self.blocks.goal(now_ns)
-        if goal is None or not self._link.armed:
+        if goal is None or not self.status.armed:
             return None
         return self._writer.step(goal, now_ns, gently=self._ending)
 
@@ -184,26 +178,33 @@ class DeviceLoop:
                 self.blocks.stop("the driver ends")
             except DeviceError as error:
                 self._lose(error)
-        return rest is not None and self._link.armed and self._writer.written != rest
+        return rest is not None and self.status.armed and self._writer.written != rest
 
     # The link
 
     def _open(self, *, arm: bool) -> None:
         """Open the device, and go on from the voltages that it has; older goals are dropped. Raises DeviceError."""
-        self.found, held = self._link.open(arm)
+        self.found, held = opened(self._device, self._settings, arm=arm, reason=self.status.reason)
         self.latest = reading = self.found.reading
         offsets = [v - setpoint for v, setpoint in zip(reading.voltages, self.found.setpoints, strict=True)]
         self._writer.start(self.found.setpoints, offsets)
         self._writer.goal = None
         if arm:
-            self._link.set(State.ARMED)
+            self._set(State.ARMED)
         else:
-            self._link.set(State.HELD, held)
+            self._set(State.HELD, held)
 
     def _lose(self, error: DeviceError) -> None:
         self.blocks.drop(str(error))
-        self.counts.losses += 1
-        self._link.lose(error)
+        self.counts.losses += not self.status.lost
+        self._device.close()
+        self._set(State.LOST, str(error))
+        self._retry_ns = self._now_ns() + RETRY_NS
+
+    def _set(self, state: State, reason: str = "") -> None:
+        """Set the state; it goes on since it began, if only its reason is another."""
+        since = self.status.since if state is self.status.state else time.time()
+        self.status = Status(state, reason, since)
 
     def _serve(self, what: str) -> None:
         """Do what was asked, or say why not. Raises DeviceError."""
@@ -215,14 +216,14 @@ class DeviceLoop:
 
     def _done(self, what: str) -> tuple[bool, str]:
         """Return whether a request succeeds, and what to answer."""
-        if self._link.lost:
+        if self.status.lost:
             return False, self.status.reason
         if what == "arm":
-            if self._link.armed:
+            if self.status.armed:
                 return True, "it was armed"
             self._open(arm=True)
             return True, f"goes on from {volts(*self._writer.written)} V"
         stopped = self.blocks.stop("by ~/stop")
-        self._link.set(State.HELD, "stopped by ~/stop; call ~/arm to go on")
+        self._set(State.HELD, "stopped by ~/stop; call ~/arm to go on")
         there = self._writer.written if stopped else self.latest.voltages if self.latest else ()
         return True, f"held at {volts(*there)} V; {stopped or 'no block was being played'}"

@@ -47,9 +47,9 @@ class Writer:
     def __init__(self, settings: LoopSettings) -> None:
         axes, limits = settings.axes, settings.limits
         self.goal: tuple[float, ...] | None = None
-        self._axes, self._limits = axes, limits
+        self._limits = dict(zip(axes, limits, strict=True))
         self._limiter = StageLimiter(limits, 1.0 / settings.rate)
-        self._limited_ns = [-(1 << 62)] * len(limits)
+        self._limited_ns = dict.fromkeys(axes, -(1 << 62))
         self._reports = [Amplifier(each.span, REPORTED, axis) for axis, each in zip(axes, limits, strict=True)]
         self.monitor = Monitor(*self._reports)
 
@@ -69,9 +69,9 @@ class Writer:
     def step(self, goal: tuple[float, ...], now_ns: int, *, gently: bool = False) -> tuple[float, ...] | None:
         """Return the voltages (V) to write on the way to a goal (V); None if they were written last."""
         before, wanted = self.written, self._limiter.step(goal, now_ns, gently=gently)
-        for place, (v, limits) in enumerate(zip(goal, self._limits, strict=True)):
+        for (axis, limits), v in zip(self._limits.items(), goal, strict=True):
             if not limits.lower <= v <= limits.upper:
-                self._limited_ns[place] = now_ns
+                self._limited_ns[axis] = now_ns
         if wanted == before:
             return None
         for rule, v in zip(self._reports, wanted, strict=True):
@@ -87,8 +87,7 @@ class Writer:
 
     def limited(self, now_ns: int) -> tuple[str, ...]:
         """Return the axes whose commands were beyond the voltage limits lately."""
-        pairs = zip(self._axes, self._limited_ns, strict=True)
-        return tuple(axis for axis, last_ns in pairs if now_ns - last_ns < HELD_NS)
+        return tuple(axis for axis, last_ns in self._limited_ns.items() if now_ns - last_ns < HELD_NS)
 
     def at(self, voltages: Sequence[float]) -> bool:
         """Return whether these voltages (V) were written."""

@@ -8,7 +8,6 @@ from functools import partial
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -31,8 +30,9 @@ from slpi_ros.nodes.common import (
     ask_for_priority,
     read_trajectory,
     request_stop,
+    steady_timer,
 )
-from slpi_ros.nodes.device_block import BlockPhase, BlockPlayer, BlockRequest, BlockState
+from slpi_ros.nodes.device_block import BlockPhase, BlockPlayer, BlockState
 from slpi_ros.nodes.device_link import State
 from slpi_ros.nodes.device_loop import DeviceLoop
 from slpi_ros.nodes.device_writer import LoopSettings
@@ -149,9 +149,7 @@ class Driver(Node):
         self.create_subscription(JointTrajectory, "voltage_trajectory", self._on_trajectory, COMMANDS, raw=True)
         self._block_publisher = self.create_publisher(DiagnosticStatus, "voltage_trajectory_state", LATCHED)
         self._recording_publisher = self.create_publisher(JointTrajectory, "recorded_trajectory", COMMANDS)
-        # The system clock may be set back.
-        steady = Clock(clock_type=ClockType.STEADY_TIME)
-        self.create_timer(LOOK_PERIOD, self._look, clock=steady)
+        steady_timer(self, LOOK_PERIOD, self._look)
         self._thread = threading.Thread(target=self._run, name=device.name, daemon=True)
         self._thread.start()
         if values["realtime_priority"]:
@@ -193,8 +191,7 @@ class Driver(Node):
             )
 
     def _on_trajectory(self, data: bytes) -> None:
-        read = read_trajectory(data, "effort")
-        self._loop.blocks.submit(BlockRequest(read.start_ns, read.names, read.time_from_start_ns, read.values))
+        self._loop.blocks.submit(read_trajectory(data, "effort"))
 
     def _tell_block(self, state: BlockState) -> None:
         seconds, rest = divmod(state.stamp_ns, SECOND_NS)

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from rclpy.clock import Clock, ClockType
 from rclpy.node import Node
 from trajectory_msgs.msg import JointTrajectory
 
@@ -16,7 +15,7 @@ from slpi_ros.excitation.drives import DRIVES, SLEW_USED, Drive, Playback, excit
 from slpi_ros.io.messages import SECOND_NS, encode_trajectory
 from slpi_ros.model.limits import Limits, volts
 from slpi_ros.nodes import parameters as declare
-from slpi_ros.nodes.common import COMMANDS, request_stop, serve
+from slpi_ros.nodes.common import COMMANDS, request_stop, serve, steady_timer
 from slpi_ros.nodes.guarded_drive import GuardedDrive
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, limits_of, validated
 
@@ -56,7 +55,6 @@ class ExciterSettings:
 
     values: Values  # all parameters by name
     limits: tuple[Limits, ...]
-    rest: tuple[float, ...] | None  # V, before and after; None: as reported by ``stage_state``
 
     @classmethod
     def of(cls, given: Values) -> "ExciterSettings":
@@ -64,26 +62,20 @@ class ExciterSettings:
         values = validated(DECLARATIONS, given)
         if values["repeat"] and values["output"] != LIVE:
             raise UsageError(f"parameters repeat and output '{values['output']}' do not go together; set one of them")
-        settings = cls(values, limits_of(values), values["rest_voltage"])
+        settings = cls(values, limits_of(values))
         settings.drawn(values["voltage_min"])
         return settings
 
     def drawn(self, found: Sequence[float]) -> Drive:
-        """Return the excitation, from and to rest: `rest`, or the voltages (V) at which the amplifier was found."""
-        rest = self.rest or [limits.clip(v) for limits, v in zip(self.limits, found, strict=True)]
-        given = {name: self.values[name] for name in ("axes", "duration", "rate", "seed", "drive")}
-        return excite(
-            voltage_min=[each.lower for each in self.limits],
-            voltage_max=[each.upper for each in self.limits],
-            slew_limit=[SLEW_USED * each.slew if each.slew < math.inf else 0.0 for each in self.limits],
-            start=rest,
-            **given,
-        )
+        """Return the excitation, from and to rest_voltage, or the voltages (V) at which the amplifier was found."""
+        rest = self.values["rest_voltage"] or [limits.clip(v) for limits, v in zip(self.limits, found, strict=True)]
+        same = ("axes", "voltage_min", "voltage_max", "duration", "rate", "seed", "drive")
+        slew_limit = [SLEW_USED * each.slew if each.slew < math.inf else 0.0 for each in self.limits]
+        return excite(slew_limit=slew_limit, start=rest, **{name: self.values[name] for name in same})
 
 
-# Period of polls while nothing moves, and of the watch, seconds.
-POLL_PERIOD, WATCH_PERIOD = 0.1, 0.02
-LOG_PERIOD = 5.0
+# Period of the watch and of messages while it waits, seconds.
+WATCH_PERIOD, LOG_PERIOD = 0.02, 5.0
 # Time without a publisher of stage_state after which rest_voltage is taken for the voltage of the amplifier, seconds.
 NOBODY = 1.0
 # Time to wait at the end for stage_state to report the last voltage, and what such a report must then last
@@ -118,22 +110,15 @@ class Exciter(Node):
         self._timer = None
         self._live = values["output"] == LIVE
         publisher = None if self._live else self.create_publisher(JointTrajectory, "voltage_trajectory", COMMANDS)
-        self._guard = GuardedDrive(
-            self, values["axes"], self._parameter_set.settings.limits, values["rate"], values["state_timeout"],
-            publisher=publisher,
-        )  # fmt: skip
+        self._guard = GuardedDrive(self, values, publisher=publisher)
         serve(self, "~/start", self._on_start)
         serve(self, "~/stop", self._on_stop)
-        # A simulated clock may stop, and the system clock may be set back.
-        self._steady = Clock(clock_type=ClockType.STEADY_TIME)
         self._listeners, self._same_since = 0, 0.0  # number of subscribers, and since when it is the same
-        self._waiting = self.create_timer(POLL_PERIOD, self._poll, clock=self._steady, autostart=False)
         self._refusal: SlpiError | None = None
         self._rest: list[float] = []
-        self._returning = self._arriving = False
+        self._waiting = self._returning = self._arriving = self._leaving = False
         self._begun = 0.0  # of waiting, of the excitation, of its end
-        self.create_timer(WATCH_PERIOD, self._watch, clock=self._steady)
-        self._leaving = self.create_timer(POLL_PERIOD, self._poll_report, clock=self._steady, autostart=False)
+        steady_timer(self, WATCH_PERIOD, self._watch)
         if values["autostart"]:
             self._wait()
 
@@ -143,10 +128,7 @@ class Exciter(Node):
             if self._playback and self._live:
                 self._guard.return_to(self._rest)
             elif self._playback:
-                self._return(self._playback)
-                while not self._playback.done:
-                    self._playback.next()
-                    time.sleep(1.0 / self._playback.drive.rate)
+                time.sleep(self._return(self._playback))
             self._guard.deliver()
         super().destroy_node()
 
@@ -157,17 +139,16 @@ class Exciter(Node):
     # Before the excitation
 
     def _on_start(self) -> tuple[bool, str]:
-        if self._playback or not self._waiting.is_canceled():
+        if self._playback or self._waiting:
             return False, "already started; call ~/stop first"
         self._wait()
         return True, f"drive '{self._values['drive']}' of {self._values['duration']:g} s"
 
     def _wait(self) -> None:
-        self._guard.prepare(self._parameter_set.settings.limits, self._values["rate"])
-        self._listeners, self._begun = 0, time.monotonic()
-        self._waiting.reset()
+        self._guard.prepare(self._values)
+        self._waiting, self._listeners, self._begun = True, 0, time.monotonic()
 
-    def _poll(self) -> None:
+    def _start_when_ready(self) -> None:
         """Start once the number of subscribers has not changed for the time `settle`, so that none misses samples."""
         now, listeners = time.monotonic(), self._guard.publisher.get_subscription_count()
         if listeners != self._listeners:
@@ -175,14 +156,14 @@ class Exciter(Node):
         if lacking := self._lacking():
             self.get_logger().info(f"waiting: {lacking}", throttle_duration_sec=LOG_PERIOD)
         elif listeners and now - self._same_since >= self._values["settle"]:
-            self._waiting.cancel()
+            self._waiting = False
             self._begin()
 
     def _lacking(self) -> str:
         """Return what is missing before the drive may start, and what to do; "" if nothing is."""
         lacking = self._guard.lacking()
         if lacking and self._guard.publisher.get_subscription_count() and not self._guard.heard:
-            if self._parameter_set.settings.rest and time.monotonic() - self._begun > NOBODY:
+            if self._values["rest_voltage"] and time.monotonic() - self._begun > NOBODY:
                 return ""
             return f"{lacking}; or give rest_voltage, if nothing reports where the amplifier is"
         return lacking
@@ -191,7 +172,7 @@ class Exciter(Node):
 
     def _begin(self) -> None:
         settings, heard = self._parameter_set.settings, self._guard.heard
-        found = self._guard.found() or settings.rest
+        found = self._guard.found() or settings.values["rest_voltage"]
         assert found
         try:
             self._guard.start(found)
@@ -214,15 +195,20 @@ class Exciter(Node):
         self._playback, self._begun = Playback(drive, repeat=self._values["repeat"]), time.monotonic()
         if self._live and heard:
             self._guard.begin()
-        self._timer = self.create_timer(1.0 / drive.rate, self._step, clock=self._steady)
-        self._publish_trajectory(self._playback)
+        self._timer = steady_timer(self, 1.0 / drive.rate, self._step)
+        if not self._live:
+            self._guard.publisher.publish(trajectory_of(self._playback))
         self.get_logger().info(f"exciting {', '.join(drive.axes)} for {self._values['duration']:g} s. {drive.why}")
 
     def _watch(self) -> None:
-        """Return to rest if the stage does not follow, or another publisher of voltages has appeared."""
+        """Wait for the stage; return to rest if it does not follow, or another publisher of voltages has appeared."""
         self._guard.listen()
         fault = self._guard.fault()
-        if fault is not None and self._playback and not (self._returning or self._playback.stopping):
+        if self._leaving:
+            self._leave_when_reported()
+        elif self._waiting:
+            self._start_when_ready()
+        elif fault is not None and self._playback and not (self._returning or self._playback.stopping):
             self._refusal = fault
             self.get_logger().error(f"{fault}; returning to rest")
             self._return(self._playback)
@@ -238,24 +224,20 @@ class Exciter(Node):
         playback = self._playback
         if playback is None:
             return
+        # To rest_voltage, from where the amplifier is.
+        self._arriving = self._arriving and not self._guard.at(self._rest)
         if self._returning:
             ended = self._guard.return_step(self._rest)
-        elif self._arriving and not self._guard.at(self._rest):
-            # To rest_voltage, from where the amplifier is.
+        elif self._arriving:
             self._guard.return_step(self._rest)
             self._begun, ended = time.monotonic(), False
         else:
-            self._arriving = False
             sample = playback.next()
             if self._live:
                 self._guard.move(sample)
             ended = playback.done and (not self._live or self._guard.at(sample))
         if ended:
             self._end(playback)
-
-    def _publish_trajectory(self, playback: Playback) -> None:
-        if not self._live:
-            self._guard.publisher.publish(trajectory_of(playback))
 
     def _end(self, playback: Playback) -> None:
         self.destroy_timer(self._timer)
@@ -273,10 +255,9 @@ class Exciter(Node):
                     f"the excitation took {took:.1f} s instead of {planned:.1f} s; use a lower rate on this machine"
                 )
             if self._values["autostart"]:
-                self._begun = time.monotonic()
-                self._leaving.reset()
+                self._leaving, self._begun = True, time.monotonic()
 
-    def _poll_report(self) -> None:
+    def _leave_when_reported(self) -> None:
         """Stop once ``stage_state``, if it was ever received, has reported the last voltages for some time."""
         reported = self._guard.reported
         if reported is None or self._guard.settled(self._rest, self._begun, REPORT_LASTS, REPORT_PATIENCE):
@@ -290,7 +271,7 @@ class Exciter(Node):
     # Stop
 
     def _on_stop(self) -> tuple[bool, str]:
-        self._waiting.cancel()
+        self._waiting = False
         return True, f"back in {self._return(self._playback):.1f} s" if self._playback else "at rest"
 
     def _return(self, playback: Playback) -> float:
@@ -299,7 +280,7 @@ class Exciter(Node):
             self._returning = True
             return self._guard.return_seconds(self._rest)
         if playback.stop():
-            self._publish_trajectory(playback)
+            self._guard.publisher.publish(trajectory_of(playback))
         return playback.seconds_left
 
 

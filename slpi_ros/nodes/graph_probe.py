@@ -3,6 +3,7 @@
 import math
 import time
 from collections.abc import Mapping, Sequence
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -55,11 +56,11 @@ class _Probe:
         self._state, self._command = (node.resolve_topic_name(topic) for topic in (state_topic, command_topic))
         self._times: list[tuple[float, float]] = []
         self._last: JointState | None = None
-        self._model = ""
+        self._models: list[String] = []
 
     def watch(self, seconds: float) -> Graph:
         node = self._node
-        node.create_subscription(String, "stage_model", self._on_model, LATCHED)
+        node.create_subscription(String, "stage_model", self._models.append, LATCHED)
         self._spin(DISCOVERY, lambda: bool(node.get_publishers_info_by_topic(self._state)))
         offers = node.get_publishers_info_by_topic(self._state)
         if offers and all(offer.topic_type == STATE_TYPE for offer in offers):
@@ -71,11 +72,10 @@ class _Probe:
         stamps, arrivals = np.array(self._times).reshape(-1, 2).T
         own = node.get_fully_qualified_name()
         names = [(name, space) for name, space in node.get_node_names_and_namespaces() if not name.startswith("_")]
-        try:
-            model = parse_model(self._model, "stage_model") if self._model else None
-        except SlpiError:
-            # Who publishes the document says what is wrong with it.
-            model = None
+        model = None
+        # Who publishes a document that is not valid says what is wrong with it.
+        with suppress(SlpiError):
+            model = parse_model(self._models[-1].data if self._models else "", "stage_model")
         return Graph(
             self._state,
             self._command,
@@ -98,9 +98,6 @@ class _Probe:
         stamp = state.header.stamp
         self._times.append((stamp.sec + stamp.nanosec * 1e-9, self._node.get_clock().now().nanoseconds / SECOND_NS))
         self._last = state
-
-    def _on_model(self, message: String) -> None:
-        self._model = message.data
 
     def _spin(self, seconds: float, done: Any = lambda: False) -> None:
         end = time.monotonic() + seconds

@@ -8,7 +8,7 @@ from typing import Any
 
 from rclpy.duration import Duration
 from rclpy.node import Node
-from rclpy.qos import QoSProfile, ReliabilityPolicy
+from rclpy.qos import QoSProfile
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -16,9 +16,9 @@ from std_msgs.msg import Float64MultiArray
 from slpi_ros.calibration.drive_monitor import DriveMonitor
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
 from slpi_ros.errors import RecordError
-from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.model.limits import Limits, StageLimiter
-from slpi_ros.nodes.common import COMMANDS, publishers_beside
+from slpi_ros.model.limits import StageLimiter
+from slpi_ros.nodes.common import COMMANDS, nanoseconds, publishers_beside, reliability_of
+from slpi_ros.nodes.parameters import Values, limits_of
 
 STATE, COMMAND = "stage_state", "voltage_command"
 # A voltage is at its goal within this share of the range. Time for the delivery of the last voltage.
@@ -31,38 +31,28 @@ class GuardedDrive:
     """Drive a stage within its limits, alone, from where it is, and only while it does what it is commanded.
 
     Every voltage passes `move`, the last place before it is published, which keeps the limits by the steady clock; it
-    is called at `rate` (Hz). `timeout` (s) is the longest time without a valid state during a drive. `on_state` is
-    called with each serialized state and its time on the clock of the node. The name of the node begins messages of
-    errors.
+    is called at the rate of the validated parameters `values`, which hold axes and limits as well; `state_timeout` is
+    the longest time without a valid state during a drive. `on_state` is called with each serialized state and its time
+    on the clock of the node. The name of the node begins messages of errors.
     """
 
-    def __init__(
-        self,
-        node: Node,
-        axes: Sequence[str],
-        limits: Sequence[Limits],
-        rate: float,
-        timeout: float,
-        on_state: OnState | None = None,
-        publisher: Any = None,
-    ) -> None:
-        self._node, self._axes, self._on_valid = node, tuple(axes), on_state
-        self._timeout = timeout
+    def __init__(self, node: Node, values: Values, on_state: OnState | None = None, publisher: Any = None) -> None:
+        self._node, self._axes, self._on_valid = node, tuple(values["axes"]), on_state
         self.publisher: Any = publisher or node.create_publisher(Float64MultiArray, COMMAND, COMMANDS)
-        self._subscription = None
+        self.heard = False  # whether anybody publishes, or has published, states
         self.reported: list[float] | None = None  # V, last valid
         self.hardware_id = ""
-        self.prepare(limits, rate)
+        self.prepare(values)
 
-    def prepare(self, limits: Sequence[Limits], rate: float) -> None:
-        """Begin a run within the given limits, at a rate (Hz): nothing is known of the stage."""
-        self._limits, self._period = tuple(limits), 1.0 / rate
-        self._limiter = StageLimiter(limits, self._period)
+    def prepare(self, values: Values) -> None:
+        """Begin a run within the limits and at the rate of the given parameters: nothing is known of the stage."""
+        self._limits, self._period = limits_of(values), 1.0 / values["rate"]
+        self._limiter = StageLimiter(self._limits, self._period)
         self._goals: Sequence[float] | None = None  # V, None: voltages may not be published yet
         self._since_ns = time.monotonic_ns()
         self._published = self._away = time.monotonic()  # s, of the last voltages; of the last report of others
         simulated = bool(self._node.get_parameter("use_sim_time").value)
-        self.monitor = DriveMonitor(self._axes, limits, self._timeout, simulated=simulated)
+        self.monitor = DriveMonitor(self._axes, self._limits, values["state_timeout"], simulated=simulated)
 
     @property
     def voltages(self) -> tuple[float, ...]:
@@ -74,21 +64,13 @@ class GuardedDrive:
         """Whether voltages may be published."""
         return self._goals is not None
 
-    @property
-    def heard(self) -> bool:
-        """Whether anybody publishes, or has published, states."""
-        return self._subscription is not None
-
     def listen(self) -> None:
         """Subscribe to the states with the reliability that their publishers offer; again and again until there are."""
-        if self._subscription is not None:
-            return
-        publishers = self._node.get_publishers_info_by_topic(self._node.resolve_topic_name(STATE))
-        if publishers:
-            reliable = all(each.qos_profile.reliability == ReliabilityPolicy.RELIABLE for each in publishers)
-            reliability = ReliabilityPolicy.RELIABLE if reliable else ReliabilityPolicy.BEST_EFFORT
-            qos = QoSProfile(depth=1000, reliability=reliability)
-            self._subscription = self._node.create_subscription(JointState, STATE, self._on_state, qos, raw=True)
+        topic = self._node.resolve_topic_name(STATE)
+        if not self.heard and (publishers := self._node.get_publishers_info_by_topic(topic)):
+            qos = QoSProfile(depth=1000, reliability=reliability_of(publishers))
+            self._node.create_subscription(JointState, STATE, self._on_state, qos, raw=True)
+            self.heard = True
 
     # Before a drive
 
@@ -111,7 +93,7 @@ class GuardedDrive:
     def lacking(self) -> str:
         """Return what is missing before a drive may start, with what to do; "" if nothing is."""
         topic = self._node.resolve_topic_name(STATE)
-        if self._subscription is None:
+        if not self.heard:
             return f"no publisher of {topic}; start the driver of the stage, or remap its topic"
         if not self.publisher.get_subscription_count():
             return f"no subscriber of {self.publisher.topic_name}; start the driver of the stage, or remap its topic"
@@ -210,9 +192,8 @@ class GuardedDrive:
             return
         volts, metres = (dict(zip(state.name, values, strict=False)) for values in (state.effort, state.position))
         v, y = ([float(values.get(axis, math.nan)) for axis in self._axes] for values in (volts, metres))
-        stamp = state.header.stamp
         clock_ns = self._node.get_clock().now().nanoseconds
-        if self.monitor.state(stamp.sec * SECOND_NS + stamp.nanosec, clock_ns, v, y, time.monotonic_ns()):
+        if self.monitor.state(nanoseconds(state.header.stamp), clock_ns, v, y, time.monotonic_ns()):
             self.reported, self.hardware_id = v, state.header.frame_id
             if not self.reports(self.voltages):
                 self._away = time.monotonic()

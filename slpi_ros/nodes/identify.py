@@ -7,11 +7,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 
 from rclpy.node import Node
 from std_msgs.msg import String
-from std_srvs.srv import Trigger
 
 from slpi_ros.errors import RecordError, SlpiError, UsageError, shown
 from slpi_ros.identification.fit import KINDS
@@ -22,7 +22,7 @@ from slpi_ros.model.document import parse_model, save_model
 from slpi_ros.model.sensor import LONGEST
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.nodes import parameters as declare
-from slpi_ros.nodes.common import ERROR, LATCHED, WARN, DeferredService, Diagnostics, Health, steady_timer
+from slpi_ros.nodes.common import ERROR, LATCHED, WARN, DeferredService, Diagnostics, Health, serve, steady_timer
 from slpi_ros.nodes.jobs import (
     DiagnosisOutcome,
     DiagnosisRequest,
@@ -104,17 +104,10 @@ class IdentifySettings:
         if start is not None and stop is not None and not start < stop:
             raise UsageError(f"parameter start is {start:g} s and stop {stop:g} s; start before you stop")
         output, folder = values["output"], values["watch_directory"]
+        bags, surroundings = (tuple(filter(None, values[name])) for name in ("bags", "surroundings"))
+        same = {name: checked[name] for name in ("topic", "kind", "output", "sensor_delay", "sensor_lag")}
         request = FitRequest(
-            tuple(bag for bag in values["bags"] if bag),
-            values["topic"],
-            values["kind"],
-            start,
-            stop,
-            output,
-            unconditional=values["replace"],
-            sensor_delay=checked["sensor_delay"],
-            sensor_lag=checked["sensor_lag"],
-            surroundings=tuple(topic for topic in values["surroundings"] if topic),
+            bags=bags, start=start, stop=stop, unconditional=values["replace"], surroundings=surroundings, **same
         )
         if folder:
             BagWatch(folder)
@@ -138,14 +131,8 @@ class DiagnosisService:
         self._published: DiagnosisRequest | None = None
         self._job: WorkerProcess[DiagnosisRequest, DiagnosisOutcome] | None = None
         self._last: DiagnosisRequest | None = None
-        self._outcome = DiagnosisOutcome()
-        self._temporary = ""
+        self.outcome = DiagnosisOutcome()  # of the last diagnosis
         self._service = DeferredService(node, "~/diagnose", self._start)
-
-    @property
-    def error(self) -> str:
-        """Error message of the last diagnosis; "" if none."""
-        return self._outcome.error
 
     @property
     def activity(self) -> str:
@@ -155,43 +142,41 @@ class DiagnosisService:
     @property
     def values(self) -> dict[str, object]:
         """Values for ``/diagnostics``."""
-        state = "diagnosing" if self._job else "failed" if self.error else "done" if self._last else "none"
+        state = "diagnosing" if self._job else "failed" if self.outcome.error else "done" if self._last else "none"
         return {
             "diagnosis.state": state,
             "diagnosis.bag": self._last.source if self._last else "",
             "diagnosis.folder": self._last.folder if self._last else "",
-            **{f"{axis}.verdict": verdict for axis, verdict in self._outcome.verdicts.items()},
-            **{f"{axis}.diagnosis": summary for axis, summary in self._outcome.summaries.items()},
+            **{f"{axis}.verdict": verdict for axis, verdict in self.outcome.verdicts.items()},
+            **{f"{axis}.diagnosis": summary for axis, summary in self.outcome.summaries.items()},
         }
 
     def use(self, published: DiagnosisRequest) -> None:
         """Diagnose another model from now on, which has been published, and discard the last result."""
         self._published = published
         if not self._job:
-            self._last, self._outcome = None, DiagnosisOutcome()
+            self._last, self.outcome = None, DiagnosisOutcome()
 
     def end(self) -> None:
-        """Stop the running diagnosis, if any."""
+        """Stop the running diagnosis, if any; for the end of the node."""
         if self._job:
             self._job.end()
-            self._job = None
 
     def poll(self) -> None:
         """Respond if the diagnosis is complete."""
-        outcome = self._job.outcome() if self._job else None
-        if not self._job or not outcome:
+        if not self._job or not (outcome := self._job.outcome()):
             return
-        folder, self._job, self._outcome = Path(self._job.request.folder), None, outcome
+        folder, self._job, self.outcome = Path(self._job.request.folder), None, outcome
         said = outcome.error
         if said:
             self._logger.error(said)
         else:
-            said = "; ".join(
+            causes = "; ".join(
                 f"{axis}: {verdict.replace('_', ' ')}: {outcome.summaries[axis]}"
                 for axis, verdict in outcome.verdicts.items()
             )
-            said += f" Page: {folder / 'report.html'}; extended model, not in use: {folder / 'extended_model.json'}"
-            said = shown(said)
+            files = f"Page: {folder / 'report.html'}; extended model, not in use: {folder / 'extended_model.json'}"
+            said = shown(f"{causes} {files}")
             self._logger.info(said)
         self._service.answer(not outcome.error, said)
         self._report()
@@ -203,18 +188,18 @@ class DiagnosisService:
         if not self._published:
             return NO_MODEL
         try:
-            folder = os.path.abspath(self._folder() or self._temporary_folder())
+            folder = os.path.abspath(self._folder() or self._temporary)
             request = replace(self._published, folder=folder)
             self._job = WorkerProcess(run_diagnosis, request, DiagnosisOutcome, f"{request.source}: the diagnosis")
         except OSError as error:
             return f"no diagnosis can be started: {error}; free memory or disk, or set diagnosis_directory"
-        self._last, self._outcome = request, DiagnosisOutcome()
+        self._last, self.outcome = request, DiagnosisOutcome()
         self._report()
         return ""
 
-    def _temporary_folder(self) -> str:
-        self._temporary = self._temporary or tempfile.mkdtemp(prefix="slpi_diagnosis_")
-        return self._temporary
+    @cached_property
+    def _temporary(self) -> str:
+        return tempfile.mkdtemp(prefix="slpi_diagnosis_")
 
 
 # Time from the start within which a model that somebody else has published is heard of, seconds: Fast DDS announces a
@@ -286,7 +271,7 @@ class Identify(Node):
         steady_timer(self, POLL_PERIOD, self._poll_jobs)
         steady_timer(self, WATCH_PERIOD, self._poll_bags)
         steady_timer(self, self._settings.diagnostic_period, self._report)
-        self.create_service(Trigger, "~/identify", self._on_trigger)
+        serve(self, "~/identify", self._on_trigger)
         parameters.follow(self._on_change)
         self._begin()
 
@@ -321,8 +306,8 @@ class Identify(Node):
     def _poll_bags(self) -> None:
         """Queue newly completed bags of the watched folder; warn once about abandoned ones."""
         for bag in self._watch.poll() if self._watch else ():
-            if not _is_utf8(bag):
-                # Neither a parameter nor a message can name it.
+            if str(bag) != str(bag).encode(errors="ignore").decode():
+                # Lone surrogates stand for bytes that are not UTF-8: neither a parameter nor a message can name it.
                 self._fail(RecordError(f"{bag}: skipped: its name is not UTF-8; rename it"))
                 continue
             self.get_logger().info(shown(f"{bag} is complete"))
@@ -333,22 +318,17 @@ class Identify(Node):
                 self.get_logger().warning(shown(abandonment([bag])))
         self._start_next()
 
-    def _on_trigger(self, request: Trigger.Request, response: Trigger.Response) -> Trigger.Response:
+    def _on_trigger(self) -> tuple[bool, str]:
         """Publish a withheld model, if any; else identify again from the given bags or from the newest watched bag."""
         if self._doubtful:
             asked, document = self._doubtful
             self._take(asked, FitOutcome(document))
-            response.success = not self._error
-            response.message = self._error or shown(f"published the model of {asked.source}")
-            return response
+            return not self._error, self._error or shown(f"published the model of {asked.source}")
         try:
             self._begin()
         except SlpiError as error:
-            response.success, response.message = False, str(error)
-            return response
-        response.success = self._job is not None
-        response.message = shown(f"identifying {self._job.request.source}") if self._job else NOTHING_TO_DO
-        return response
+            return False, str(error)
+        return (True, shown(f"identifying {self._job.request.source}")) if self._job else (False, NOTHING_TO_DO)
 
     def _start_next(self) -> None:
         """Start the next queued identification, unless one is running."""
@@ -383,18 +363,17 @@ class Identify(Node):
             self._start_next()
 
     def _take(self, request: FitRequest, outcome: FitOutcome) -> None:
+        self._doubtful = (request, outcome.document) if outcome.doubt else None
         if outcome.doubt:
-            self._doubtful = request, outcome.document
             self._error = shown(
                 f"{outcome.doubt}; the model in use stays: call ~/identify to publish the new one nevertheless, or "
                 "record more"
             )
             self.get_logger().warning(self._error)
         elif outcome.error:
-            self._doubtful = None
             self._fail(outcome.error)
         else:
-            self._doubtful, self._error = None, ""
+            self._error = ""
             self._publish(request, outcome.document)
         self._report()
 
@@ -447,7 +426,7 @@ class Identify(Node):
             (WARN if self._doubtful else ERROR, self._error),
             (WARN, NOTHING_TO_DO if idle and not self._error else ""),
             (WARN, abandonment(self._abandoned) if self._abandoned else ""),
-            (WARN, self._diagnosis.error),
+            (WARN, self._diagnosis.outcome.error),
         )
         found = tuple((level, text) for level, text in problems if text)
         self._diagnostics.report(Health(found, self._activity(), values, model.hardware_id))
@@ -456,15 +435,6 @@ class Identify(Node):
         if self._job:
             return f"identifying {self._job.request.source} for {self._job.seconds:.0f} s"
         return self._diagnosis.activity or (described(self._model) if self._model.axes else "")
-
-
-def _is_utf8(path: Path) -> bool:
-    """Return whether the name of a path is UTF-8; other bytes reach Python as lone surrogates."""
-    try:
-        str(path).encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def abandonment(bags: Sequence[Path]) -> str:

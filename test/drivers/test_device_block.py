@@ -10,8 +10,9 @@ import pytest
 from drivers.kinds import KINDS
 
 from slpi_ros.drivers import gcs_waves, labjack, nidaqmx, stream
+from slpi_ros.io.messages import TrajectoryArrays
 from slpi_ros.model.limits import Limits
-from slpi_ros.nodes.device_block import BlockPhase, BlockRequest
+from slpi_ros.nodes.device_block import BlockPhase
 from slpi_ros.nodes.device_link import State
 from slpi_ros.nodes.device_loop import DeviceLoop
 from slpi_ros.nodes.device_writer import LoopSettings
@@ -60,7 +61,7 @@ class Bench:
     def submit(self, voltages, period, names=None, stamp=7):
         voltages = np.asarray(voltages, float)
         times = np.round(np.arange(len(voltages)) * period * 1e9).astype(np.int64)
-        self.loop.blocks.submit(BlockRequest(stamp, names or self.axes[: voltages.shape[1]], times, voltages))
+        self.loop.blocks.submit(TrajectoryArrays(stamp, names or self.axes[: voltages.shape[1]], times, voltages))
 
     def path(self, place=0):
         axis = self.simulator.axes[place]
@@ -159,7 +160,7 @@ def test_what_is_refused_moves_nothing(bench, voltages, names, named):
 
 @pytest.mark.parametrize("bench", [("gcs", 2, [20.0, 30.0], False)], indirect=True)
 def test_times_that_do_not_increase(bench):
-    bench.loop.blocks.submit(BlockRequest(7, ("a0",), np.array([0, 0]), np.array([[20.0], [20.0]])))
+    bench.loop.blocks.submit(TrajectoryArrays(7, ("a0",), np.array([0, 0]), np.array([[20.0], [20.0]])))
     bench.turn(2)
     assert bench.told == [BlockPhase.REFUSED]
 

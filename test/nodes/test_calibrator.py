@@ -22,6 +22,7 @@ from slpi_ros.io.tables import write_table  # noqa: E402
 from slpi_ros.model.document import parse_model  # noqa: E402
 from slpi_ros.nodes.calibration_job import PATH  # noqa: E402
 from slpi_ros.nodes.calibrator import DECLARATIONS, settings_of  # noqa: E402
+from slpi_ros.nodes.parameters import validated  # noqa: E402
 
 LOW, HIGH, SLEW, RATE, REST = -10.0, 90.0, 300.0, 100.0, 5.0
 PARAMETERS = {
@@ -250,16 +251,16 @@ def test_a_desired_path_is_sampled_at_the_rate(tmp_path):
     values = {entry.name: entry.default for entry in DECLARATIONS} | {
         "voltage_min": 0.0, "voltage_max": 100.0, "output": "out", "desired_path": str(tmp_path / "path.csv"),
     }  # fmt: skip
-    path = settings_of(values).path["x"]
+    path = settings_of(validated(DECLARATIONS, values)).path["x"]
     assert path == pytest.approx(1e-6 * np.sin(2 * np.pi * 4.0 * np.arange(201) / 200.0), abs=1e-12)
     for wrong in ({"rate": 10.0}, {"axes": ["y"]}):
         with pytest.raises(UsageError, match="desired_path"):
-            settings_of(values | wrong)
+            settings_of(validated(DECLARATIONS, values | wrong))
     # Micrometres, and no time.
     for times, y in ((t, np.sin(t)), (0.0 * t, 1e-6 * t)):
         write_table(tmp_path / "path.csv", times, {"x": y}, "m")
         with pytest.raises(UsageError, match="desired_path"):
-            settings_of(values)
+            settings_of(validated(DECLARATIONS, values))
 
 
 def test_a_folder_in_use_is_not_touched(tmp_path):

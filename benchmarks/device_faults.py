@@ -19,12 +19,12 @@ from dataclasses import dataclass, field
 import numpy as np
 from driver import DEVICES, PRIORITY, priority
 
+from slpi_ros.devices.link import State
+from slpi_ros.devices.loop import DeviceLoop
+from slpi_ros.devices.writer import LoopSettings
 from slpi_ros.drivers.base import Channel, Device
 from slpi_ros.drivers.registry import make_device
 from slpi_ros.model.limits import Limits
-from slpi_ros.nodes.device_link import State
-from slpi_ros.nodes.device_loop import DeviceLoop
-from slpi_ros.nodes.device_writer import LoopSettings
 from slpi_ros.simulation.devices.base import FAULTS, Fault
 from slpi_ros.simulation.devices.registry import make_simulator
 

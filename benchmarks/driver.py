@@ -21,11 +21,11 @@ from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
+from slpi_ros.devices.loop import DeviceLoop
+from slpi_ros.devices.writer import LoopSettings
 from slpi_ros.drivers.base import Channel
 from slpi_ros.drivers.registry import make_device
 from slpi_ros.model.limits import Limits
-from slpi_ros.nodes.device_loop import DeviceLoop
-from slpi_ros.nodes.device_writer import LoopSettings
 from slpi_ros.simulation.devices.registry import make_simulator
 
 # Device of the driver, simulated device, its axes, V/V of the amplifier, and where it is served.

@@ -19,7 +19,7 @@ LAYERS = (
     {"papers", "nodes", "fleet"},
     {"reports"},
     {"calibration"},
-    {"workflows", "export"},
+    {"workflows", "export", "devices"},
     {"diagnosis"},
     {"identification", "compensator"},
     {"learning"},

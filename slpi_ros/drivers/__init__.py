@@ -1,1 +1,1 @@
-"""Real amplifiers and sensors, without ROS: bare input and output; limits stand in `slpi_ros.nodes.device_loop`."""
+"""Real amplifiers and sensors, without ROS: bare input and output; limits stand in `slpi_ros.devices.loop`."""

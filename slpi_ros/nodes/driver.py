@@ -13,6 +13,10 @@ from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
+from slpi_ros.devices.block import BlockPhase, BlockPlayer, BlockState
+from slpi_ros.devices.link import State
+from slpi_ros.devices.loop import DeviceLoop
+from slpi_ros.devices.writer import LoopSettings
 from slpi_ros.drivers.base import Channel, Reading
 from slpi_ros.drivers.registry import MODULES, make_device
 from slpi_ros.errors import SlpiError, UsageError, shown
@@ -32,10 +36,6 @@ from slpi_ros.nodes.common import (
     request_stop,
     steady_timer,
 )
-from slpi_ros.nodes.device_block import BlockPhase, BlockPlayer, BlockState
-from slpi_ros.nodes.device_link import State
-from slpi_ros.nodes.device_loop import DeviceLoop
-from slpi_ros.nodes.device_writer import LoopSettings
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, limits_of, validated
 
 HOLD, REST = "hold", "rest"

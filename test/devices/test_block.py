@@ -9,13 +9,13 @@ import numpy as np
 import pytest
 from drivers.kinds import KINDS
 
+from slpi_ros.devices.block import BlockPhase
+from slpi_ros.devices.link import State
+from slpi_ros.devices.loop import DeviceLoop
+from slpi_ros.devices.writer import LoopSettings
 from slpi_ros.drivers import gcs_waves, labjack, nidaqmx, stream
 from slpi_ros.io.messages import TrajectoryArrays
 from slpi_ros.model.limits import Limits
-from slpi_ros.nodes.device_block import BlockPhase
-from slpi_ros.nodes.device_link import State
-from slpi_ros.nodes.device_loop import DeviceLoop
-from slpi_ros.nodes.device_writer import LoopSettings
 from slpi_ros.simulation.devices.base import LOST, SILENT, Fault
 
 RATE, SLEW = 500.0, 2000.0

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from drivers.kinds import KINDS
 
+from slpi_ros.devices.link import State
+from slpi_ros.devices.loop import DeviceLoop
+from slpi_ros.devices.writer import LoopSettings
 from slpi_ros.drivers import labjack, nidaqmx, stream
 from slpi_ros.drivers.base import DeviceError
 from slpi_ros.model.limits import Limits
-from slpi_ros.nodes.device_link import State
-from slpi_ros.nodes.device_loop import DeviceLoop
-from slpi_ros.nodes.device_writer import LoopSettings
 from slpi_ros.simulation.devices.base import FAULTS, LATE, LOST, SILENT, Fault
 
 pytestmark = pytest.mark.long

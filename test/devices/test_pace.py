@@ -5,7 +5,7 @@ from bisect import bisect
 import numpy as np
 import pytest
 
-from slpi_ros.nodes.device_pace import CATCH_UP, SLACK, Pace
+from slpi_ros.devices.pace import CATCH_UP, SLACK, Pace
 
 PERIOD = 1_000_000
 END = 1000 * PERIOD

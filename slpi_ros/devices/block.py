@@ -7,10 +7,10 @@ from enum import Enum
 
 import numpy as np
 
+from slpi_ros.devices.writer import LoopSettings, Writer
 from slpi_ros.drivers.base import Block, Device, Reading, Recording
 from slpi_ros.io.messages import SECOND_NS, TrajectoryArrays
 from slpi_ros.model.limits import volts
-from slpi_ros.nodes.device_writer import LoopSettings, Writer
 
 # Steps of a block may exceed the slew limit by rounding, and its samples miss the device's clock by this share.
 ROUNDING, OFF_CLOCK = 1e-6, 1e-3

@@ -3,8 +3,8 @@
 from dataclasses import dataclass
 from enum import Enum
 
+from slpi_ros.devices.writer import ROUNDING, LoopSettings
 from slpi_ros.drivers.base import Device, Found, UnsuitableError
-from slpi_ros.nodes.device_writer import ROUNDING, LoopSettings
 
 
 class State(Enum):

@@ -2,9 +2,9 @@
 
 import pytest
 
+from slpi_ros.devices.writer import ROUNDING, LoopSettings, Writer
 from slpi_ros.drivers.base import Reading
 from slpi_ros.model.limits import Limits
-from slpi_ros.nodes.device_writer import ROUNDING, LoopSettings, Writer
 
 MS = 1_000_000
 

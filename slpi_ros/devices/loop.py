@@ -9,13 +9,13 @@ from contextlib import suppress
 from dataclasses import dataclass
 
 from slpi_ros.compensator.statistics import Timing
+from slpi_ros.devices.block import BUSY, Blocks
+from slpi_ros.devices.link import State, Status, opened
+from slpi_ros.devices.pace import Pace
+from slpi_ros.devices.writer import LoopSettings, Writer
 from slpi_ros.drivers.base import Device, DeviceError, Found, Reading
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import volts
-from slpi_ros.nodes.device_block import BUSY, Blocks
-from slpi_ros.nodes.device_link import State, Status, opened
-from slpi_ros.nodes.device_pace import Pace
-from slpi_ros.nodes.device_writer import LoopSettings, Writer
 
 # Longest wait of the thread for a command, seconds.
 LONGEST_SLEEP = 0.05

@@ -6,12 +6,12 @@ from contextlib import contextmanager
 import numpy as np
 import pytest
 
+from slpi_ros.devices.link import State
+from slpi_ros.devices.loop import DeviceLoop
+from slpi_ros.devices.writer import LoopSettings
 from slpi_ros.drivers.base import Channel, DeviceError, LinkError, UnsuitableError
 from slpi_ros.drivers.registry import make_device
 from slpi_ros.model.limits import Limits
-from slpi_ros.nodes.device_link import State
-from slpi_ros.nodes.device_loop import DeviceLoop
-from slpi_ros.nodes.device_writer import LoopSettings
 from slpi_ros.simulation.devices.base import FAULTS, LATE, SILENT, Fault
 from slpi_ros.simulation.devices.gcs import GcsSimulator
 

@@ -140,10 +140,14 @@ class Reporter:
 
     def note_out_of_reach(self) -> None:
         """Keep which displacements cannot be reached now, and what to do."""
-        held = [axis for axis in self._controller.axes if axis.held]
-        out = [f"axis {axis.name}{_reach(axis)}" for axis in held]
+        out, within = [], True
+        for axis in self._controller.axes:
+            if axis.held and axis.model and (desired := axis.tracking.desired) is not None:
+                low, high = axis.model.displacement_range
+                within &= low <= desired <= high
+                out.append(f"axis {axis.name} at {desired * 1e6:.5g} of {low * 1e6:.5g} to {high * 1e6:.5g} µm")
         remedy = "send displacements within the identified range"
-        if all(_in_range(axis) for axis in held):
+        if within:
             remedy = (
                 "that is within the range: send a slower path, one further from its ends, or widen voltage_min and "
                 "voltage_max if they are narrower than the model"
@@ -356,24 +360,6 @@ def _axis_problems(axis: Axis, factor: float, moving: bool) -> Iterator[Problem]
                 f"{drift.samples} measurements; held-out error {usual * 1e9:.1f} nm: {remedy(axis, drift)}"
             )
             yield Problem("", WARN, text)
-
-
-def _reach(axis: Axis) -> str:
-    """Return the desired displacement of an axis beside the identified range as text."""
-    desired, model = axis.tracking.desired, axis.model
-    if desired is None or model is None:
-        return ""
-    low, high = model.displacement_range
-    return f" at {desired * 1e6:.5g} of {low * 1e6:.5g} to {high * 1e6:.5g} µm"
-
-
-def _in_range(axis: Axis) -> bool:
-    """Return whether the desired displacement of an axis is in the identified range: what is too much is its rate."""
-    desired, model = axis.tracking.desired, axis.model
-    if desired is None or model is None:
-        return False
-    low, high = model.displacement_range
-    return low <= desired <= high
 
 
 def _learning_values(learning: PathLearning) -> dict[str, object]:

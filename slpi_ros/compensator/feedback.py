@@ -47,7 +47,7 @@ class Feedback:
     #
     # The error refers to the setpoint at the time of the measurement, not to the present one, and for a sensor with a
     # known delay or lag to the setpoint as that sensor would tell it, see `slpi_ros.model.sensor.Sensed`.
-    release_time = 0.1
+    release_time = 0.1  # s
     longest_gap = MAX_DT  # s; longer intervals count as this long
 
     def __init__(self, gains: PidGains, pace: RateLimiter, correction_limit: float = inf) -> None:
@@ -68,7 +68,7 @@ class Feedback:
         self._desired: float | None = None
 
     def switch(self, on: bool) -> None:
-        """Enable the PID without a voltage step at the next measurement, or let the correction decay; if it is not."""
+        """Enable the PID without a voltage step at the next measurement; once it is off, the correction decays."""
         if on and not self.enabled:
             self._taking_over = True
         self.enabled = on

@@ -1,4 +1,4 @@
-"""Validation of axis names, displacements and stamps: a message is accepted as a whole, or moves no axis."""
+"""Why messages are rejected, and checks of names and displacements: accepted as a whole, or no axis moves."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass

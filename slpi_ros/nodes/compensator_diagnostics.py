@@ -11,7 +11,7 @@ from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.feedback import Drift
 from slpi_ros.compensator.persistence import KNOWN, RESETTING, RESTORED
-from slpi_ros.compensator.statistics import COUNTED, Counts, Timing, TimingReport
+from slpi_ros.compensator.statistics import COUNTED, Counts, Timing
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.model.stage_model import StageModel, seconds_since
 from slpi_ros.nodes.common import ERROR, WARN, Diagnostics, Health
@@ -221,19 +221,14 @@ class Reporter:
 
     def _timing_values(self) -> dict[str, object]:
         elapsed = max(time.perf_counter() - self._begun, 1e-3)
-        timing = self.timing.report()
-        p50, p99, longest = _microseconds(timing)
-        late_p50, late_p99, latest = _microseconds(self.lateness.report())
-        return {
-            "rate_hz": f"{self._since('received') / elapsed:.1f}",
-            "jitter_ms": f"{timing.jitter * 1e3:.3f}" if timing else "",
-            "latency_p50_us": p50,
-            "latency_p99_us": p99,
-            "latency_max_us": longest,
-            "deadline_error_p50_us": late_p50,
-            "deadline_error_p99_us": late_p99,
-            "deadline_error_max_us": latest,
-        }
+        values: dict[str, object] = {"rate_hz": f"{self._since('received') / elapsed:.1f}", "jitter_ms": ""}
+        for name, timing in (("latency", self.timing), ("deadline_error", self.lateness)):
+            report = timing.report()
+            if name == "latency" and report:
+                values["jitter_ms"] = f"{report.jitter * 1e3:.3f}"
+            for place, part in enumerate(("p50", "p99", "max")):
+                values[f"{name}_{part}_us"] = f"{report.latency[place] * 1e6:.0f}" if report else ""
+        return values
 
     def _model_values(self, model: StageModel | None) -> dict[str, object]:
         kinds = [model.axis(axis.name).kind for axis in self._controller.axes] if model else []
@@ -301,12 +296,6 @@ class Reporter:
             for name, note in ownership.notes.items():
                 if note:
                     yield Problem("", WARN, f"axis '{name}': {note}")
-
-
-def _microseconds(report: TimingReport | None) -> tuple[str, str, str]:
-    """Format median, 99th percentile and maximum in microseconds."""
-    p50, p99, longest = (f"{each * 1e6:.0f}" for each in report.latency) if report else ("", "", "")
-    return p50, p99, longest
 
 
 def _axis_values(axis: Axis, created: str) -> dict[str, object]:

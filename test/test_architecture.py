@@ -269,3 +269,30 @@ def test_what_the_architecture_page_names_is_there():
         there = (ROOT / path).read_text()
         for name in re.findall(r"`(\w+)`", names):
             assert re.search(rf"(def|class) {name}\b|^{name} = ", there, re.MULTILINE), (path, name)
+
+
+# What one can hold in the head, for the code that moves a stage.
+MOST_METHODS, MOST_ATTRIBUTES = 35, 20
+
+
+def test_classes_that_move_a_stage_are_small_enough_to_be_read():
+    found = {}
+    for path in FILES:
+        if part_of(path) not in ("compensator", "devices", "nodes"):
+            continue
+        for node in nodes_of(path):
+            if isinstance(node, ast.ClassDef):
+                methods = [each for each in node.body if isinstance(each, ast.FunctionDef | ast.AsyncFunctionDef)]
+                attributes = {each.target.id for each in node.body if isinstance(each, ast.AnnAssign)}
+                attributes |= {
+                    each.attr
+                    for each in ast.walk(node)
+                    if isinstance(each, ast.Attribute)
+                    and isinstance(each.ctx, ast.Store)
+                    and isinstance(each.value, ast.Name)
+                    and each.value.id == "self"
+                }
+                found[name_of(path), node.name] = len(methods), len(attributes)
+    assert ("compensator/axis.py", "Axis") in found
+    large = {name: size for name, size in found.items() if size[0] > MOST_METHODS or size[1] > MOST_ATTRIBUTES}
+    assert not large

@@ -22,8 +22,9 @@ from slpi_ros.nodes.path_learning import OFF, PathLearning
 CONSTANT, NO_CONSTANT = 0.9, 0.3
 # A sample of a trajectory that comes so much later than it should is told, seconds.
 LATE = 0.01
-# Shortest time between two log messages of the same kind, seconds.
+# Shortest time between two log messages of what is counted, seconds; other problems are logged each time they appear.
 LOG_PERIOD = 5.0
+COUNTED_KINDS = ("messages", "trajectories", "measurements", "held", "late")
 
 
 class Problem(NamedTuple):
@@ -50,10 +51,11 @@ class Log:
         self._remarks[kind] = text
 
     def tell(self, problems: Iterable[Problem]) -> None:
-        """Log the problems that the last report did not hold, those of one kind once in `LOG_PERIOD`."""
+        """Log the problems that the last report did not hold."""
         now, present = time.monotonic(), {each.kind: each for each in problems if each.kind}
         for kind, (_, level, text) in present.items():
-            if kind not in self._present and now - self._logged.get(kind, -math.inf) >= LOG_PERIOD:
+            since = now - self._logged.get(kind, -math.inf)
+            if kind not in self._present and (since >= LOG_PERIOD or kind.partition(" ")[0] not in COUNTED_KINDS):
                 # Not in one line: a call of the logger keeps its severity.
                 if level == ERROR:
                     self._logger.error(text)

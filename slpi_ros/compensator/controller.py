@@ -125,7 +125,7 @@ class Controller:
     @property
     def mode(self) -> OperatingMode:
         """What the whole stage does."""
-        if not self.active:
+        if not self.active or self._following:
             return self._lifecycle
         kinds = [axis.motion.kind for axis in self.axes]
         if Kind.RESET in kinds:
@@ -502,7 +502,7 @@ class Controller:
         due: int | None = None
         if self.ownership.owned:
             for axis in self.axes:
-                at_ns = axis.due_ns
+                at_ns = axis.due_ns if axis.loop.active else axis.motion.due_ns
                 if at_ns is not None and (due is None or at_ns < due):
                     due = at_ns
         point = self.trajectory.next_deadline_ns

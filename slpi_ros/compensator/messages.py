@@ -20,13 +20,10 @@ class Messages:
     def use(self, rules: TimestampRules) -> None:
         """Replace the rules for time stamps."""
         self.jump, self._max_age_ns = rules.jump, int(rules.max_age * SECOND_NS)
+        # Whether the arrival time is needed even of messages that carry a time stamp.
+        self.needs_arrival = self._max_age_ns > 0
         for axis in self.by_name.values():
             axis.samples.jump_ns = int(rules.jump * SECOND_NS)
-
-    @property
-    def needs_arrival(self) -> bool:
-        """Whether the arrival time is needed even of messages that carry a time stamp."""
-        return self._max_age_ns > 0
 
     def axes(self, names: Sequence[str]) -> list[Axis]:
         """Return the named axes; raise RejectedError as `require_names` does."""

@@ -147,9 +147,9 @@ class RateLimiter:
         self._moved(v, now_ns, goal)
         return v
 
-    def move(self, voltage: float, now_ns: int) -> float:
-        """Move to `voltage` (V) as far as `reach` allows; return the voltage (V) to output."""
-        lowest, highest = self.reach(now_ns)
+    def move(self, voltage: float, now_ns: int, reach: tuple[float, float] | None = None) -> float:
+        """Move to `voltage` (V) as far as `reach` at `now_ns` allows, if that is known; return the voltage (V)."""
+        lowest, highest = reach or self.reach(now_ns)
         v = min(max(voltage, lowest), highest)
         self._moved(v, now_ns, voltage)
         return v

@@ -364,7 +364,8 @@ class StreamingInverse:
         # that for the rate limits.
         memory, pace, around = self.memory, self.pace, self._around
         if not self._before and pace.limits.acceleration == inf:
-            v = self.goal = pace.move(self._invert(elapsed, h, *pace.reach(now_ns)), now_ns)
+            reach = pace.reach(now_ns)
+            v = self.goal = pace.move(self._invert(elapsed, h, *reach), now_ns, reach)
             self._missing = self._beyond_rounding(h)
             return v
         state, felt, limits = memory.snapshot(), around.snapshot() if around else None, pace.limits

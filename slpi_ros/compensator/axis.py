@@ -136,17 +136,17 @@ class Axis:
     def surround(self, values: dict[str, float]) -> None:
         """Take values of quantities that the stage follows; they count from the next sample on."""
         self.surroundings |= values
+        self.motion.wake()
         self.stream.surround(values)
         if self.loop.closed:
             self.loop.applied(self.stream).surround(values)
         self.uncertainty.surround(values)
 
-    def move_zero(self, zero: Zero, model: AxisModel, now_ns: int) -> None:
-        """Continue with the same `model` with another zero, at the present voltage and without a goal."""
+    def move_zero(self, zero: Zero, model: AxisModel) -> None:
+        """Continue with the same `model` with another zero, at the present voltage, after `stop`."""
         self.loop.leave(self.stream)
         self.use(model, self.prepare(model))
         self.zero = zero
-        self.begin(Idle(), now_ns)
         self.loop.forget_offsets()
         if self.loop.closed:
             self.loop.close(self.stream, self.samples.given_ns)
@@ -167,6 +167,7 @@ class Axis:
             self.stream.limits = allowed = self.stream.restricted(allowed)
             self.stream.pace.change(allowed, period)
         self.output.change(allowed, period)
+        self.motion.wake()
 
     def retune(self, settings: LoopSettings) -> None:
         """Replace the feedback settings without a voltage step; feedback that was switched off for a fault resumes."""

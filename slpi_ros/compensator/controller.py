@@ -18,7 +18,6 @@ from slpi_ros.compensator.motion import (
     REFUSALS,
     REPLACED_BY,
     Fault,
-    Hold,
     Idle,
     Kind,
     Ramp,
@@ -183,7 +182,7 @@ class Controller:
 
     def activate(self, now_ns: int) -> None:
         """Start processing messages at `now_ns` (ns), with all axes at rest at their present voltages."""
-        self._lifecycle = OperatingMode.STREAMING
+        self._lifecycle, self.stopped = OperatingMode.STREAMING, None
         self.watchdog.start(now_ns)
         for axis in self.axes:
             axis.rest(now_ns)
@@ -255,7 +254,7 @@ class Controller:
             self.model = model
             for axis in axes:
                 zero = Zero.now(SENSOR, axis.zero.offset + known[axis.name])
-                axis.move_zero(zero, model.axis(axis.name), now_ns)
+                axis.move_zero(zero, model.axis(axis.name))
             self._couple()
         return moved
 
@@ -303,6 +302,7 @@ class Controller:
             return ""
         why = self.ownership.arm(now_ns, steady_ns)
         if not why:
+            self.stopped = None
             self.watchdog.start(now_ns)
         return why
 
@@ -378,8 +378,7 @@ class Controller:
         if self._stage:
             self._stage.decouple(dict(zip(names, displacements, strict=True)))
             for axis in self.axes:
-                if isinstance(axis.motion, Hold):
-                    axis.motion.wake(now_ns + axis.period_ns)
+                axis.motion.wake(now_ns + axis.period_ns)
         held = slewing = began = False
         for axis, y, ahead in zip(axes, displacements, aheads, strict=True):
             was_held = axis.held
@@ -593,6 +592,7 @@ class Controller:
                 self.messages.by_name[found.axis].loop.switch_off(found)
         if self.watchdog.react(safety):
             if self.watchdog.safe_voltages and self.ownership.owned:
+                self.stopped = StopReason.SILENCE
                 self.ramp(safety.voltages, safety.rate, now_ns)
             else:
                 # The voltages are held, not the displacements: nothing follows creep or a sensor without commands.

@@ -140,6 +140,9 @@ class Motion:
     def end(self, axis: Moved, now_ns: int) -> None:
         """Leave the axis at its present voltage, for the next motion."""
 
+    def wake(self, due_ns: int = 0) -> None:
+        """Look at the voltage again at `due_ns`, as another axis moves, or limits, model or surroundings changed."""
+
 
 class Idle(Motion):
     """Nothing follows."""
@@ -198,8 +201,8 @@ class Hold(Motion):
             self._rest, still_ns = (now_ns, v, v), 0
         self.due_ns = now_ns + (RESTING_NS if still_ns >= REST_NS else axis.period_ns)
 
-    def wake(self, due_ns: int) -> None:
-        """Look at the voltage again soon, because another axis moves."""
+    def wake(self, due_ns: int = 0) -> None:
+        """Look at the voltage again soon."""
         self._rest, self.due_ns = None, due_ns
 
 

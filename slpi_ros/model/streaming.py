@@ -271,8 +271,11 @@ class StreamingInverse:
 
     def approach(self, dt: float, now_ns: int) -> float:
         """Go on, `dt` (s) later, towards `goal`, which rate limits have held back; return the voltage (V)."""
-        if self._direct:
+        if not self._before and self.pace.limits.acceleration == inf:
+            # The limits held back the displacement of the hysteresis, of which the voltage follows.
             self._command = self._move(dt, dt, self.desired, now_ns)
+            if not self._direct:
+                self._follow(dt)
             return self._command
         desired, goal = self.desired, self.goal
         v = self.pace.step(goal, now_ns)

@@ -397,7 +397,7 @@ class Compensator(LifecycleNode):
             self._reporter.report()
 
     def _on_period(self) -> None:
-        configured = self._controller.mode is not OperatingMode.UNCONFIGURED
+        configured = not self._reporter.finalized and self._controller.mode is not OperatingMode.UNCONFIGURED
         self._reporter.others = self._output.others if configured else []
         self._reporter.report()
         self._reporter.start_window()

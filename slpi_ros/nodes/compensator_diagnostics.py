@@ -10,6 +10,7 @@ from rclpy.node import Node
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.feedback import Drift
+from slpi_ros.compensator.motion import Kind
 from slpi_ros.compensator.persistence import KNOWN, RESETTING, RESTORED
 from slpi_ros.compensator.statistics import COUNTED, Counts, Timing
 from slpi_ros.compensator.validation import RejectedError
@@ -101,6 +102,8 @@ class Reporter:
         if model:
             for axis in self._controller.axes:
                 values |= _axis_values(axis, model.created)
+                if axis.name in self._controller.trajectory.moving:
+                    values[f"{axis.name}.motion"] = Kind.TRAJECTORY.value
                 values[f"{axis.name}.start_voltage"] = self._controller.ownership.notes.get(axis.name, "")
             now_ns = time.monotonic_ns()
             for key, quantity in self._controller.surroundings.items():

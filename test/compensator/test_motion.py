@@ -3,6 +3,8 @@
 The clock is a made one: what is given when is exact.
 """
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ from benchmarks.episodes import Ratios, Wire  # noqa: E402
 from slpi_ros.compensator.controller import Controller, StopReason  # noqa: E402
 from slpi_ros.compensator.feedback import LoopSettings, PidGains  # noqa: E402
 from slpi_ros.compensator.validation import RejectedError  # noqa: E402
+from slpi_ros.effects.creep import Creep  # noqa: E402
 from slpi_ros.model.limits import Limits  # noqa: E402
 
 MS, START_NS = 1_000_000, 5_000_000_000
@@ -263,3 +266,44 @@ def test_a_measurement_that_starts_the_loop_in_motion_changes_no_rate(bench, fee
     made.controller.measure(["x"], [made.controller.axes[0].stream.memory.displacement], made.now_ns)
     made.send(0.5, TOP)
     made.check()
+
+
+def test_a_step_with_creep_arrives_at_the_slew_limit_and_not_when_the_hold_begins():
+    """What the limit held back was taken for reached, up to three intervals between the messages."""
+    made = Bench(Limits(0.0, 100.0, 1000.0))
+    model = stage_model()
+    creep = Creep((0.3,), (0.05,))
+    made.controller.use_model(replace(model, axes={"x": replace(model.axes["x"], effects=(creep,))}))
+    for y in (3e-6, 6e-6, 2e-6, 6e-6):
+        made.wish(y)
+        made.run(0.2)
+        axis = made.controller.axes[0]
+        assert axis.stream.uncoupled_displacement == pytest.approx(y, rel=0.02)
+        assert not axis.slewing
+        made.run(0.4)
+    made.check()
+
+
+def test_wider_limits_are_used_by_a_hold_at_once_and_not_by_its_feedback():
+    made = Bench(Limits(0.0, 50.0), feedback=True)
+    for _ in range(40):
+        made.run(0.005)
+        made.controller.measure(["x"], [made.controller.axes[0].expected], made.now_ns)
+        made.wish(8e-6)
+    made.run(3.0)
+    made.controller.use_limits([Limits(0.0, 100.0)], made.now_ns)
+    made.run(0.01)
+    axis = made.controller.axes[0]
+    assert axis.stream.uncoupled_displacement == pytest.approx(8e-6, abs=1e-9)
+
+
+def test_a_zero_that_is_set_in_motion_brakes():
+    made = Bench(GENTLE)
+    made.send(0.3, TOP)
+    made.controller.measure(["x"], [made.controller.axes[0].expected + 1e-8], made.now_ns)
+    assert made.controller.axes[0].output.in_motion
+    made.controller.set_zero(made.now_ns)
+    assert made.controller.ramping
+    made.run(1.0)
+    made.check()
+    made.check_stands()

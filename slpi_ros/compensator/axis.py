@@ -69,11 +69,6 @@ class Axis:
         return self.output.voltage
 
     @property
-    def period_ns(self) -> int:
-        """Output period, nanoseconds."""
-        return round(self.output.period * SECOND_NS)
-
-    @property
     def holds(self) -> bool:
         """Whether the voltage of a constant displacement changes: because of effects, other axes, or feedback."""
         return self.loop.active or not self.stream.timeless
@@ -220,7 +215,7 @@ class Axis:
             self.loop.leave(self.stream)
             self.initial.assumed = None
         if isinstance(motion, Ramp):
-            motion.due_ns = now_ns + self.period_ns
+            motion.due_ns = now_ns + self.output.period_ns
 
     def stop(self, now_ns: int) -> None:
         """End the present motion: an axis that moves within an acceleration limit brakes to rest, then it stays."""

@@ -378,7 +378,7 @@ class Controller:
         if self._stage:
             self._stage.decouple(dict(zip(names, displacements, strict=True)))
             for axis in self.axes:
-                axis.motion.wake(now_ns + axis.period_ns)
+                axis.motion.wake(now_ns + axis.output.period_ns)
         held = slewing = began = False
         for axis, y, ahead in zip(axes, displacements, aheads, strict=True):
             was_held = axis.held

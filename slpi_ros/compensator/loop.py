@@ -83,10 +83,6 @@ class Loop:
         recent = [offset for t, offset in self._offsets if now_ns - t <= OFFSET_AGE_NS]
         return median(recent) if recent else None
 
-    @property
-    def _period_ns(self) -> int:
-        return max(round(self._output.period * SECOND_NS), 1)
-
     # Model and settings
 
     def use(self, model: AxisModel, allowed: Limits, stream: StreamingInverse, now_ns: int) -> None:
@@ -203,10 +199,10 @@ class Loop:
         dt = max((now_ns - self.driven_ns) * 1e-9, 0.0)
         self._between += dt
         # The correction is that of the period that has ended.
-        return self._output_with(dt, y, v, coupled, now_ns, self._period_ns)
+        return self._output_with(dt, y, v, coupled, now_ns, self._output.period_ns)
 
     def _output_with(self, dt: float, y: float, v: float, coupled: float, now_ns: int, early_ns: int = 0) -> float:
-        applied, period_ns = self._applied, self._period_ns
+        applied, period_ns = self._applied, self._output.period_ns
         begin_ns = (now_ns - early_ns) // period_ns * period_ns
         first, self._corrected_ns = begin_ns > self._corrected_ns, max(begin_ns, self._corrected_ns)
         applied.coupled = coupled

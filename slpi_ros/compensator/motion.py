@@ -90,10 +90,6 @@ class Moved(Protocol):
     slewing: bool
 
     @property
-    def period_ns(self) -> int:
-        """Output period, nanoseconds."""
-
-    @property
     def holds(self) -> bool:
         """Whether the voltage of a constant displacement changes."""
 
@@ -162,7 +158,7 @@ class Approach(Motion):
     def step(self, axis: Moved, now_ns: int) -> None:
         """Go on towards that voltage."""
         axis.approach(now_ns)
-        follow(axis, now_ns, max(axis.samples.hold_ns, now_ns + axis.period_ns))
+        follow(axis, now_ns, max(axis.samples.hold_ns, now_ns + axis.output.period_ns))
 
 
 class Stream(Motion):
@@ -199,7 +195,7 @@ class Hold(Motion):
         self._rest = since_ns, lowest, highest
         if highest - lowest > REST_SHARE * (limits.upper - limits.lower) * max(still_ns, REST_NS) * 1e-9:
             self._rest, still_ns = (now_ns, v, v), 0
-        self.due_ns = now_ns + (RESTING_NS if still_ns >= REST_NS else axis.period_ns)
+        self.due_ns = now_ns + (RESTING_NS if still_ns >= REST_NS else axis.output.period_ns)
 
     def wake(self, due_ns: int = 0) -> None:
         """Look at the voltage again soon."""
@@ -214,7 +210,7 @@ def follow(axis: Moved, now_ns: int, hold_ns: int) -> None:
     following: type[Approach | Stream] = Stream
     due_ns = hold_ns if axis.holds else None
     if axis.slewing or axis.output.in_motion:
-        following, due_ns = Approach, now_ns + axis.period_ns
+        following, due_ns = Approach, now_ns + axis.output.period_ns
     if type(axis.motion) is following:
         axis.motion.due_ns = due_ns
     else:
@@ -250,7 +246,7 @@ class Ramp(Motion):
     def step(self, axis: Moved, now_ns: int) -> None:
         """Output the next voltage; after the last one, nothing follows."""
         axis.drive(self.next(axis.output, now_ns), now_ns)
-        self.due_ns = now_ns + axis.period_ns
+        self.due_ns = now_ns + axis.output.period_ns
         if self.done:
             axis.begin(Idle(), now_ns)
             axis.return_inside(now_ns)

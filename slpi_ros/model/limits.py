@@ -98,6 +98,11 @@ class RateLimiter:
             self.period = max(self.period, self._pending[1])
 
     @property
+    def period_ns(self) -> int:
+        """Output period, nanoseconds."""
+        return max(round(self.period * 1e9), 1)
+
+    @property
     def in_motion(self) -> bool:
         """Whether the voltage moves within an acceleration limit, and so has to brake before it rests."""
         return self.rate != 0.0 and self._limits.acceleration < inf

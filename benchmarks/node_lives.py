@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 
 from slpi_ros.compensator.controller import Controller
-from slpi_ros.compensator.persistence import MemoryFile, SavedAxis, load_memory, model_id
+from slpi_ros.compensator.persistence import SavedAxis, load_memory, model_id
 from slpi_ros.compensator.statistics import COUNTED
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import SlpiError
@@ -228,10 +228,13 @@ class Life:
 
         rng = self.rng
         number = rng.choice(list(ENDS))
-        saved = None
+        kept = None
         with suppress(SlpiError):
-            saved = MemoryFile(self.disk.path).find(self.model, AXES)
-        self.twin = Twin(self.model, dict(saved) if saved else None)
+            saved = load_memory(self.disk.path)
+            if saved:
+                saved.require_fit(self.model, AXES)
+                kept = dict(saved.axes)
+        self.twin = Twin(self.model, kept)
         if self.disk.kind in ("no folder", "/proc", "/dev/full", "broken file"):
             self.note(f"memory file: {self.disk.kind}")
         elif self.disk.kind in ("full", "read-only") and rng.random() < 0.6:

@@ -10,6 +10,7 @@ from slpi_ros.compensator.amplifier import TOLERATED_SHARE
 from slpi_ros.errors import RecordError, SlpiError
 from slpi_ros.excitation.drives import Drive
 from slpi_ros.io.record import Record
+from slpi_ros.io.stage_name import same_stage
 from slpi_ros.workflows.records import Source, require_records
 
 # The range of a recorded voltage may differ from that of its drive by this share.
@@ -37,7 +38,7 @@ def require_kept(
         for axis in settings.axes:
             record.require_axis(axis)
             _require_limits(record, axis, drive, settings)
-        if before and record.hardware_id and before.hardware_id and record.hardware_id != before.hardware_id:
+        if before and not same_stage(record.hardware_id, before.hardware_id):
             raise RecordError(f"of stage '{record.hardware_id}', {before.source} of '{before.hardware_id}'")
         moving = [axis for axis in settings.axes if np.ptp(drive.voltage[axis]) > 0.0]
         if fitted:

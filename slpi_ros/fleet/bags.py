@@ -22,6 +22,7 @@ from slpi_ros.effects.registry import to_document
 from slpi_ros.errors import SlpiError
 from slpi_ros.fleet.sources import Bag
 from slpi_ros.io.record import Record
+from slpi_ros.io.stage_name import stage_name
 from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.document import load_model, save_model
 from slpi_ros.model.stage_model import StageModel
@@ -151,7 +152,7 @@ def examine(bag: Bag, reading: Source) -> Examined:
         return Examined(bag, bag.stage, refused={"": _reason(error)}, seconds=time.process_time() - began)
     return Examined(
         bag,
-        bag.stage or record.hardware_id,
+        stage_name(bag.stage or record.hardware_id),
         record.hardware_id,
         int(record.time_ns[0]),
         tuple(axis for axis in record.axes if axis not in assessed.refused),

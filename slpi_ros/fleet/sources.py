@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.io.stage_name import stage_name
 from slpi_ros.model.document import load_model
 from slpi_ros.model.stage_model import StageModel
 
@@ -72,10 +73,10 @@ def load_models(folder: _Path | None) -> dict[str, StageModel]:
     models: dict[str, StageModel] = {}
     for path in sorted(Path(folder).rglob("*.json")):
         model = load_model(path)
-        if not model.hardware_id:
+        if not (stage := stage_name(model.hardware_id)):
             raise UsageError(f"{path}: the model names no stage; identify it from a bag with a hardware id")
-        if model.hardware_id not in models or model.created > models[model.hardware_id].created:
-            models[model.hardware_id] = model
+        if stage not in models or model.created > models[stage].created:
+            models[stage] = model
     return models
 
 

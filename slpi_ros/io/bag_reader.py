@@ -21,6 +21,7 @@ from slpi_ros.io.bag_storage import MessageBlock, read_mcap, read_sqlite
 from slpi_ros.io.input_limits import MOST_AXES, require_count
 from slpi_ros.io.messages import JOINT_STATE, MESSAGE_TYPES, QUANTITY_TYPES, SECOND_NS, Message, kind_of, read_message
 from slpi_ros.io.record import BLOCK, Course, Record, each_block, new_column, order_note, release
+from slpi_ros.io.stage_name import stage_name
 from slpi_ros.io.surroundings import MOST, Chosen, courses, since_start_of, topics_beside, wild
 
 _Path = str | os.PathLike[str]
@@ -142,7 +143,7 @@ def require_different(paths: Iterable[_Path]) -> list[Path]:
 def require_one_stage(records: Sequence[Record]) -> None:
     """Raise RecordError unless all records have the same hardware id; a missing id differs from every given id."""
     for record in records[1:]:
-        if record.hardware_id != records[0].hardware_id:
+        if stage_name(record.hardware_id) != stage_name(records[0].hardware_id):
             raise RecordError(
                 f"{record.source}: of {_stage_of(record)}, but {records[0].source} of {_stage_of(records[0])}; give "
                 "bags of one stage, with the same hardware id"

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.input_limits import LONGEST_NAME, MOST_AXES
+from slpi_ros.io.stage_name import stage_name
 
 # Times (s) from the first stamp of a record, ascending, and values of a quantity, NaN: no reading, shape (n,) each.
 Course = tuple[FloatArray, FloatArray]
@@ -184,12 +185,12 @@ def common_stage(records: Sequence[Record], hardware_id: str = "") -> str:
     """Return the hardware id of the stage of all records and a model, "" if unknown; UsageError if several."""
     if not records:
         raise UsageError("no record given; give at least one")
-    stages = {hardware_id: "the model"} if hardware_id else {}
-    for record in records:
-        if record.hardware_id:
-            stages.setdefault(record.hardware_id, record.source)
+    stages: dict[str, tuple[str, str]] = {}
+    for given, source in [(hardware_id, "the model"), *((each.hardware_id, each.source) for each in records)]:
+        if name := stage_name(given):
+            stages.setdefault(name, (given, source))
     if len(stages) > 1:
-        listed = ", ".join(f"'{stage}' ({source})" for stage, source in stages.items())
-        what = "records and a model" if hardware_id else "records"
+        listed = ", ".join(f"'{stage}' ({source})" for stage, source in stages.values())
+        what = "records and a model" if stage_name(hardware_id) else "records"
         raise UsageError(f"several stages: {listed}; use {what} of one stage")
-    return next(iter(stages), "")
+    return next((given for given, _ in stages.values()), "")

@@ -14,6 +14,7 @@ from slpi_ros.errors import ModelError, UsageError, length
 from slpi_ros.io.atomic_file import all_or_nothing
 from slpi_ros.io.input_limits import MODEL_BYTES, read_input
 from slpi_ros.io.schemas import format_document, validate
+from slpi_ros.io.stage_name import stage_name
 from slpi_ros.learning.axis_learner import AxisLearner, PassReport
 from slpi_ros.model.document import format_model
 from slpi_ros.model.stage_model import Signal, StageModel, check_time
@@ -169,7 +170,7 @@ class Learner:
             json.dumps(document, allow_nan=False)
         except ValueError:
             raise ModelError(f"{source}: a number in it is not finite; learn the path anew") from None
-        if document["hardware_id"] != self.model.hardware_id:
+        if stage_name(document["hardware_id"]) != stage_name(self.model.hardware_id):
             raise ModelError(
                 f"{source}: learned on stage '{document['hardware_id']}', the model is of '{self.model.hardware_id}'; "
                 "learn the path of this stage anew"

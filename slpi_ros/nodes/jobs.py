@@ -20,6 +20,7 @@ from slpi_ros.errors import ModelError, RecordError, SlpiError, dependencies_nee
 from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.input_limits import TOPIC_MODEL_CHARACTERS
 from slpi_ros.io.record import Record
+from slpi_ros.io.stage_name import same_stage
 from slpi_ros.model.document import format_model, load_model, model_from, parse_model
 from slpi_ros.model.stage_model import StageModel
 
@@ -118,7 +119,7 @@ class StageIdentity:
         other, lacking = "", [axis for axis in self.axes if axis not in record.axes]
         if lacking:
             other = f"no axis '{lacking[0]}', only {', '.join(record.axes)}"
-        if record.hardware_id and self.hardware_id and record.hardware_id != self.hardware_id:
+        if not same_stage(record.hardware_id, self.hardware_id):
             other = f"of stage '{record.hardware_id}'"
         if other:
             name = f" of stage '{self.hardware_id}'" if self.hardware_id else ""

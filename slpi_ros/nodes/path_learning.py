@@ -16,6 +16,7 @@ from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.path_passes import ComingAgain, PassRecorder, PathPasses
 from slpi_ros.compensator.trajectory import Trajectory
 from slpi_ros.compensator.validation import RejectedError
+from slpi_ros.io.stage_name import same_stage
 from slpi_ros.learning.repeated_paths import AxisProgress, Learned, RepeatedPaths, SampledPath
 from slpi_ros.model.document import format_model, parse_model
 from slpi_ros.model.stage_model import StageModel
@@ -114,7 +115,7 @@ class PathLearning:
 
     def use_model(self, model: StageModel | None) -> None:
         """Take another model: what was learned with the last one is learned afresh."""
-        if self._model is not None and model is not None and model.hardware_id != self._model.hardware_id:
+        if self._model is not None and model is not None and not same_stage(model.hardware_id, self._model.hardware_id):
             # Those of another stage.
             self.passes.corrections.clear()
         self._model = model

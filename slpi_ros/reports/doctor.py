@@ -11,6 +11,7 @@ from slpi_ros.calibration.drive_monitor import FARTHEST
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
 from slpi_ros.identification.record_quality import assess, findings
 from slpi_ros.io.record import Record
+from slpi_ros.io.stage_name import same_stage, stage_name
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports.text import model_limits
 
@@ -79,7 +80,7 @@ def _of_record(record: Record, model: StageModel | None, limits: Range | None) -
             known = model.axes[axis].voltage_range
             yield _within(axis, "the voltage went", reached, known, "the model", "identify a model of the whole range")
     if model is not None:
-        yield from _same_stage(record.hardware_id, record.axes, model)
+        yield from _of_one_stage(record.hardware_id, record.axes, model)
 
 
 def check_model(model: StageModel, limits: Range | None = None) -> list[Check]:
@@ -98,7 +99,7 @@ def check_model(model: StageModel, limits: Range | None = None) -> list[Check]:
         if limits is not None:
             told = "identify within the limits, or correct them"
             checks.append(_overlap(f"model: axis {name}", axis.voltage_range, limits, told))
-    if not model.hardware_id:
+    if not stage_name(model.hardware_id):
         checks.append(Check(NOTE, "model: without hardware id: that it is of this stage cannot be checked"))
     return checks
 
@@ -115,7 +116,7 @@ def check_graph(graph: Graph, model: StageModel | None = None) -> list[Check]:
     checks += _of_commands(graph)
     known = model or graph.model
     if known is not None and graph.stamps.size:
-        checks += _same_stage(graph.hardware_id, graph.axes, known)
+        checks += _of_one_stage(graph.hardware_id, graph.axes, known)
         checks += _of_range(graph, known)
     elif known is None:
         checks.append(Check(NOTE, "model: none on stage_model; give one by --model to compare it with the stage"))
@@ -190,7 +191,7 @@ def _of_values(graph: Graph) -> Iterator[Check]:
             yield Check(FAILED, f"{topic}: axis {axis}: position {y:.4g} is no displacement in metres; publish metres")
         else:
             yield Check(OK, f"{topic}: axis {axis} at {y * 1e6:.4g} µm, {v:.4g} V")
-    if not graph.hardware_id:
+    if not stage_name(graph.hardware_id):
         yield Check(NOTE, f"{topic}: without a hardware id in header.frame_id: models cannot be told apart by stage")
 
 
@@ -207,16 +208,18 @@ def _of_commands(graph: Graph) -> Iterator[Check]:
         yield Check(FAILED, f"{topic}: no subscriber; start the driver of the amplifier, or remap its topic")
 
 
-def _same_stage(hardware_id: str, axes: Sequence[str], model: StageModel) -> Iterator[Check]:
-    if hardware_id and model.hardware_id and hardware_id != model.hardware_id:
+def _of_one_stage(hardware_id: str, axes: Sequence[str], model: StageModel) -> Iterator[Check]:
+    agree = same_stage(hardware_id, model.hardware_id)
+    if not agree:
         text = f"model: of stage '{model.hardware_id}', but the stage is '{hardware_id}'; take its own model"
         yield Check(FAILED, text)
     lacking = [axis for axis in model.axes if axis not in axes]
     if lacking:
         text = f"model: axes {', '.join(lacking)} are not among those of the stage, {', '.join(axes) or 'none'}"
         yield Check(FAILED, f"{text}; name the axes alike")
-    elif not (hardware_id and model.hardware_id and hardware_id != model.hardware_id):
-        known = "hardware id and axes agree" if hardware_id and model.hardware_id else "axes agree"
+    elif agree:
+        named = stage_name(hardware_id) and stage_name(model.hardware_id)
+        known = "hardware id and axes agree" if named else "axes agree"
         yield Check(OK, f"model: {known} with those of the stage")
 
 

@@ -75,18 +75,23 @@ class VoltageLimits:
     then: str = ", then call ~/arm"
 
 
-class _Pieces(deque[tuple[int, float, float]]):
-    """Lowest and highest of values (V) in pieces of time, by the number of the piece."""
+class _Pieces(deque[list[float]]):
+    """Number, lowest and highest value (V) of pieces of time."""
 
-    def add(self, low: float, high: float, now_ns: int) -> None:
-        """Take values from `low` to `high` at `now_ns`."""
+    def add(self, low: float, high: float, now_ns: int) -> bool:
+        """Take values from `low` to `high` at `now_ns`; return whether a piece has begun."""
         number = now_ns // PIECE_NS
-        if self and self[-1][0] == number:
-            _, lowest, highest = self.pop()
-            low, high = min(low, lowest), max(high, highest)
-        self.append((number, low, high))
+        last = self[-1] if self else None
+        if last is None or last[0] != number:
+            self.append([number, low, high])
+            return True
+        if low < last[1]:
+            last[1] = low
+        if high > last[2]:
+            last[2] = high
+        return False
 
-    def since(self, oldest_ns: int) -> list[tuple[int, float, float]]:
+    def since(self, oldest_ns: int) -> list[list[float]]:
         """Return the pieces from that of a time on."""
         return [each for each in self if each[0] >= oldest_ns // PIECE_NS]
 
@@ -176,10 +181,11 @@ class Amplifier(Rule):
             return
         if voltage != last:
             self._output_ns = now_ns
-        self._outputs.add(min(last, voltage), max(last, voltage), now_ns)
-        oldest = (now_ns - self.window_ns) // PIECE_NS
-        while self._outputs[0][0] < oldest:
-            self._outputs.popleft()
+        low, high = (last, voltage) if last < voltage else (voltage, last)
+        if self._outputs.add(low, high, now_ns):
+            oldest = (now_ns - self.window_ns) // PIECE_NS
+            while self._outputs[0][0] < oldest:
+                self._outputs.popleft()
 
     # Where it is
 

@@ -202,8 +202,8 @@ class TrajectoryExecutor:
     @property
     def next_deadline_ns(self) -> int | None:
         """Deadline of the next sample, nanoseconds; None if no point is pending."""
-        tracks = self._tracks
-        return tracks[0].next_ns if len(tracks) == 1 else min((track.next_ns for track in tracks), default=None)
+        # Asked for several times a message, mostly without a trajectory.
+        return min([track.next_ns for track in self._tracks]) if self._tracks else None
 
     @property
     def moving(self) -> set[str]:

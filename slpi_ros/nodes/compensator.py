@@ -387,13 +387,13 @@ class Compensator(LifecycleNode):
                 self._report_held()
         self._note_mode()
 
-    def _note_mode(self) -> None:
-        """Tell that the mode has changed; a reset that has ended, in whatever way, is answered."""
+    def _note_mode(self, news: bool = False) -> None:
+        """Tell that the mode has changed, or other `news`; a reset that has ended, in whatever way, is answered."""
         mode, before = self._controller.mode, self._mode
-        if mode is not before:
-            self._mode = mode
-            if before is OperatingMode.RESETTING:
-                self._memory.answer_reset()
+        self._mode = mode
+        if before is OperatingMode.RESETTING and mode is not before:
+            self._memory.answer_reset()
+        if news or mode is not before:
             self._reporter.report()
 
     def _on_period(self) -> None:
@@ -414,7 +414,7 @@ class Compensator(LifecycleNode):
             return
         self._work_off()
         now_ns = time.monotonic_ns()
-        before = controller.mode, reporter.quantities.keys(), controller.trajectory.too_fast
+        before = reporter.quantities.keys(), controller.trajectory.too_fast
         if now_ns - self._looked_ns >= LOOK_NS:
             self._looked_ns = now_ns
             self._surroundings.update([topic for topic in values["surroundings"] if topic])
@@ -432,7 +432,6 @@ class Compensator(LifecycleNode):
                 self.get_logger().error(f"block given up: {finding.reason}")
         if values["rearm"] and not controller.ownership.armed and not controller.arm(now_ns, REARM_NS):
             self.get_logger().warning(f"rearmed at {volts(*controller.voltages)} V")
-        if news or (controller.mode, reporter.quantities.keys(), controller.trajectory.too_fast) != before:
-            reporter.report()
+        self._note_mode(bool(news) or (reporter.quantities.keys(), controller.trajectory.too_fast) != before)
         self._output.publish_tracking_errors()
         self._output.publish_uncertainty()

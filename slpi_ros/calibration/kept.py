@@ -38,7 +38,7 @@ def require_kept(
         for axis in settings.axes:
             record.require_axis(axis)
             _require_limits(record, axis, drive, settings)
-        if before and not same_stage(record.hardware_id, before.hardware_id):
+        if before and not same_stage(record.hardware_id, before.hardware_id, settings.accept_stage):
             raise RecordError(f"of stage '{record.hardware_id}', {before.source} of '{before.hardware_id}'")
         moving = [axis for axis in settings.axes if np.ptp(drive.voltage[axis]) > 0.0]
         if fitted:

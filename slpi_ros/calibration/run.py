@@ -20,6 +20,7 @@ from slpi_ros.excitation.drives import SWEEP, Drive
 from slpi_ros.identification.progress import listening
 from slpi_ros.identification.signal_statistics import noise
 from slpi_ros.io.record import Record
+from slpi_ros.io.stage_name import same_stage
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.workflows.diagnose import DiagnoseRequest, diagnose
 from slpi_ros.workflows.identify import IdentifyRequest, identify
@@ -215,6 +216,8 @@ class _Calibration:
         if recording.kept:
             fitted = kind not in (CHECK_DRIVE, SWEEP)
             require_kept(recording.record, drive, self._settings, self._first, fitted=fitted)
+        if self._settings.accept_stage and same_stage(recording.record.hardware_id, self._settings.accept_stage):
+            recording = replace(recording, record=replace(recording.record, hardware_id=""))
         return recording
 
     def _check(self) -> None:

@@ -16,6 +16,7 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument("--model", metavar="MODEL.json", required=True, help="of the same stage")
     common.add_output(command, "DIR", "folder of diagnosis.json, extended_model.json and report.html")
     common.add_topics(command)
+    common.add_accept_stage(command)
     common.add_axes(command, help="default: every axis that bag and model share")
     common.add_with(
         command, "every temperature, humidity, pressure, force, number and other stage of the bag, each by itself"

@@ -20,6 +20,7 @@ def _add_options(command: ArgumentParser) -> None:
         help="slpi-published: operators start at rest, as published; default: no",
     )
     common.add_topics(command)
+    common.add_accept_stage(command)
     common.add_axes(command, help="default: every axis of the bag")
     common.add_with(command, "none")
     common.add_span(command)

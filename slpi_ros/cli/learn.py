@@ -34,6 +34,7 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument("--report", metavar="DIR", help="also write a page with charts; default: none")
     common.add_output(command, "NEXT.csv", "the next pass: columns time_s, <axis>_m")
     common.add_topics(command)
+    common.add_accept_stage(command)
     common.add_axes(command, help="default: every axis that bags and model share")
     common.add_span(command, "the passes")
 

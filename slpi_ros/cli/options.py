@@ -28,6 +28,14 @@ def add_bags(command: ArgumentParser, text: str = "") -> None:
     )
 
 
+def add_accept_stage(command: ArgumentParser) -> None:
+    """Add ``--accept-stage``."""
+    command.add_argument(
+        "--accept-stage", metavar="NAME",
+        help="take what is named so for the stage of the model and of the other records; default: refuse other stages",
+    )  # fmt: skip
+
+
 def add_output(command: ArgumentParser, metavar: str, text: str, *, required: bool = True) -> None:
     """Add ``-o`` and ``--overwrite``."""
     command.add_argument("-o", "--output", metavar=metavar, required=required, help=text)
@@ -177,7 +185,11 @@ def source_of(options: Namespace) -> "Source":
     from slpi_ros.workflows.records import Source
 
     start, stop = getattr(options, "start", None), getattr(options, "stop", None)
-    return Source(options.bags, topic, options.axis, start, stop, surroundings=getattr(options, "quantities", None))
+    accepted = getattr(options, "accept_stage", None) or ""
+    if accepted:
+        options.remarks.append(f"what is named stage '{accepted}' is taken for this one (--accept-stage)")
+    quantities = getattr(options, "quantities", None)
+    return Source(options.bags, topic, options.axis, start, stop, surroundings=quantities, accept_stage=accepted)
 
 
 def _topics_of(options: Namespace) -> "str | SeparateTopics":

@@ -18,6 +18,7 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument("bags", metavar="BAG", nargs="+", help="in any order; the oldest record is used first")
     common.add_output(command, "MODEL.json", "may be the input model file")
     common.add_topic(command)
+    common.add_accept_stage(command)
     common.add_axes(command, help="default: every axis that bag and model share")
     common.add_with(command, "those that the model follows")
     common.add_span(command)

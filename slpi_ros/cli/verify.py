@@ -44,6 +44,7 @@ def _add_options(command: ArgumentParser) -> None:
     common.add_with(command, "those that the model follows")
     common.add_span(command, "what is judged")
     common.add_topics(command)
+    common.add_accept_stage(command)
     common.add_axes(command, help="default: every axis that bags and model share")
     common.add_sensor(command)
 

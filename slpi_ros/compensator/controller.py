@@ -28,6 +28,7 @@ from slpi_ros.compensator.motion import (
 from slpi_ros.compensator.motion import Block as BlockMotion
 from slpi_ros.compensator.ownership import Ownership
 from slpi_ros.compensator.persistence import RESETTING, SENSOR, MemoryConfidence, SavedAxis, Zero
+from slpi_ros.compensator.reporters import WhoseStage
 from slpi_ros.compensator.statistics import Counts
 from slpi_ros.compensator.surroundings import Surroundings
 from slpi_ros.compensator.trajectory import Trajectory, TrajectoryExecutor
@@ -78,7 +79,8 @@ class Controller:
     replaces the present ones, as the table allows, or is rejected; `stop` is the one way to end them without another
     one. The first voltage starts from where the amplifiers are (`locate`), and their reports are held
     against what was output (`report`). A loaded model cannot relax the limits; one with another `hardware_id` is
-    refused, "" accepts any. Without `loops`, feedback is disabled.
+    refused, "" accepts any, and what is named `accept_stage` is taken for this stage. Without `loops`, feedback is
+    disabled.
     """
 
     def __init__(
@@ -90,12 +92,14 @@ class Controller:
         loops: Sequence[LoopSettings] = (),
         period: float = PERIOD,
         starts: Sequence[str | float] = (),
+        accept_stage: str = "",
     ) -> None:
         self.names = list(axes)
         loops = loops or [OPEN_LOOP] * len(self.names)
         self.axes = [Axis(*each, period) for each in zip(self.names, limits, loops, strict=True)]
         self.messages = Messages(self.axes, time or TimestampRules())
-        self.ownership = Ownership(self.axes, starts)  # whether voltages may be output
+        # Whether voltages may be output.
+        self.ownership = Ownership(self.axes, starts, WhoseStage(hardware_id, accept_stage))
         self.surroundings = Surroundings(self.axes)  # quantities that the model in use follows
         self.counts = Counts()
         # The model in use, and as it was identified, before its zeros were moved.
@@ -110,7 +114,6 @@ class Controller:
         self.stopped: StopReason | None = None  # why all motion was ended last
         self._lifecycle = OperatingMode.UNCONFIGURED
         self._stage: StageStream | None = None
-        self._hardware_id = hardware_id
         # Offset of the trajectory clock from the monotonic clock at the last call, nanoseconds.
         self._clock_ahead_ns = 0
 
@@ -179,6 +182,7 @@ class Controller:
     def cleanup(self) -> None:
         """Discard the model; the voltages are unchanged."""
         self._lifecycle, self.model, self.identified = OperatingMode.UNCONFIGURED, None, None
+        self.ownership.stage.model = ""
 
     def activate(self, now_ns: int) -> None:
         """Start processing messages at `now_ns` (ns), with all axes at rest at their present voltages."""
@@ -205,11 +209,9 @@ class Controller:
     ) -> None:
         """Replace the model in use, or raise and keep the old one; the voltages are unchanged."""
         # Only the first model uses what was saved; `last_voltages` (V) are of axes saved with another model.
-        if self._hardware_id and model.hardware_id and model.hardware_id != self._hardware_id:
-            raise UsageError(
-                f"the model has hardware id '{model.hardware_id}', this stage has '{self._hardware_id}'; "
-                "use a model of this stage, or correct hardware_id"
-            )
+        stage = self.ownership.stage
+        if why := stage.difference(model=model.hardware_id):
+            raise UsageError(f"{why}; use a model of this stage, correct hardware_id, or set accept_stage")
         if self.mode is OperatingMode.BLOCK:
             self._require(Kind.STREAM, 0)
         turns, identified = {name: each.reversal_voltages for name, each in (saved or {}).items()}, model
@@ -233,7 +235,7 @@ class Controller:
                 axis.confidence, axis.zero = saved[axis.name].confidence(own.hysteresis_range), saved[axis.name].zero
             elif first and last_voltages and axis.name in last_voltages:
                 axis.locate(last_voltages[axis.name], 0)
-        self.model, self.identified = model, identified
+        self.model, self.identified, stage.model = model, identified, model.hardware_id
         self._couple()
         self.surroundings.use(model)
 
@@ -279,8 +281,12 @@ class Controller:
 
     # Where the amplifiers are
 
-    def report(self, names: Sequence[str], voltages: Sequence[float], now_ns: int) -> bool:
-        """Take the voltages (V) that amplifiers report; return whether somebody now moves an axis, until `arm`."""
+    def report(self, names: Sequence[str], voltages: Sequence[float], now_ns: int, stage: str = "") -> bool:
+        """Take the voltages (V) that amplifiers report; return whether somebody now moves an axis, until `arm`.
+
+        `stage` is the name that the stage gives itself.
+        """
+        self.ownership.stage.hear(stage, now_ns)
         for name, voltage in zip(names, voltages, strict=False):
             axis = self.messages.by_name.get(name)
             if axis:

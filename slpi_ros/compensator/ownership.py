@@ -4,7 +4,9 @@ from collections.abc import Sequence
 
 from slpi_ros.compensator.amplifier import MUTE_NS, STEADY_NS
 from slpi_ros.compensator.axis import Axis
-from slpi_ros.compensator.monitor import Monitor
+from slpi_ros.compensator.listening import Listening
+from slpi_ros.compensator.monitor import Finding, Monitor
+from slpi_ros.compensator.reporters import SoleReporter, WhoseStage
 from slpi_ros.compensator.validation import NOT_ARMED, STARTING, RejectedError
 from slpi_ros.model.limits import volts
 
@@ -16,13 +18,23 @@ BEYOND = 2.0
 
 
 class Ownership:
-    """Whether voltages may be output: the amplifiers are where they are known to be, and nobody else moves them."""
+    """Whether voltages may be output: it is this stage that reports, and nobody else moves it.
 
-    def __init__(self, axes: Sequence[Axis], starts: Sequence[str | float] = ()) -> None:
+    `listening`, if there is one, may hold the first voltage back.
+    """
+
+    def __init__(
+        self, axes: Sequence[Axis], starts: Sequence[str | float] = (), stage: WhoseStage | None = None
+    ) -> None:
         self.reporting = self.started = False  # ``stage_state`` has a publisher; a voltage was output
         self.obstacle: tuple[str, str] | None = None  # cause and reason why no voltage may be output
         self.notes: dict[str, str] = {}  # by axis: what is not certain about the voltage at the start
-        self.monitor = Monitor(*(axis.amplifier for axis in axes))  # what it finds stops the output until `arm`
+        self.stage = stage or WhoseStage()
+        self.reporters = {axis.name: SoleReporter(axis.name) for axis in axes}
+        self.listening: Listening | None = None
+        # What they find stops the output until `arm`: who reports, and what.
+        self.identity = Monitor(self.stage, *self.reporters.values())
+        self.monitor = Monitor(*(axis.amplifier for axis in axes))
         self._axes = axes
         self._starts = list(starts) or [AUTO] * len(axes)  # `AUTO`, `MEASURED`, `SAVED`, or volts
         self._since_ns, self._ever = 0, False
@@ -43,14 +55,17 @@ class Ownership:
         self.obstacle = STARTING, "the voltages at the start are not known yet; send it again"
 
     def locate(self, now_ns: int) -> None:
-        """Move the axes of the model to where their amplifiers are found."""
+        """Move the axes of the model to where their amplifiers are found, once it is known who is there."""
+        if found := self._stranger(now_ns) or (self.listening and self.listening.check(now_ns)):
+            self.obstacle = STARTING, str(found)
+            return
         missing = ""
         for axis, start in zip(self._axes, self._starts, strict=True):
-            found, self.notes[axis.name] = self._find(axis, start, now_ns)
-            if found is None:
+            at, self.notes[axis.name] = self._find(axis, start, now_ns)
+            if at is None:
                 missing = missing or f"axis '{axis.name}': {self.notes[axis.name]}"
                 continue
-            axis.locate(found, now_ns)
+            axis.locate(at, now_ns)
         self.obstacle = (STARTING, missing) if missing else None
 
     def _find(self, axis: Axis, start: str | float, now_ns: int) -> tuple[float | None, str]:
@@ -94,15 +109,26 @@ class Ownership:
                 self._take(axis, now_ns)
 
     def lost(self, now_ns: int) -> bool:
-        """Return whether somebody else has begun to move an axis; nothing may then be output until `arm`."""
-        self.monitor.check(now_ns)
-        if not (self.started and self.monitor.standing and self.armed):
+        """Return whether somebody else has begun to move or to report an axis; nothing is then output until `arm`."""
+        if not (self.started and self.armed):
             return False
-        self.obstacle = NOT_ARMED, str(self.monitor.standing[0])
-        return True
+        found = self._stranger(now_ns)
+        if not found:
+            self.monitor.check(now_ns)
+            found = next(iter(self.monitor.standing), None)
+        if found:
+            self.obstacle = NOT_ARMED, str(found)
+        return bool(found)
+
+    def _stranger(self, now_ns: int) -> Finding | None:
+        """Return that another stage reports, or somebody else does."""
+        self.identity.check(now_ns)
+        return next(iter(self.identity.standing), None)
 
     def arm(self, now_ns: int, steady_ns: int = STEADY_NS) -> str:
         """Continue from the steady voltages that are reported; return the reason if there are none, else ""."""
+        if stranger := self._stranger(now_ns):
+            return str(stranger)
         found: list[float] = []
         for axis in self._axes:
             voltage = axis.amplifier.steady(now_ns, steady_ns)

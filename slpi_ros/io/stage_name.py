@@ -28,10 +28,10 @@ def stage_name(text: str) -> str:
     return _of_device(name) or ("" if _OF_PI.fullmatch(name) or _NUMBERED.fullmatch(name) else name)
 
 
-def same_stage(one: str, other: str) -> bool:
-    """Return whether two names may be of one stage: they agree, or one of them names no stage."""
+def same_stage(one: str, other: str, accepted: str = "") -> bool:
+    """Return whether two names may be of one stage: they agree, or one of them names none, or is `accepted`."""
     names = {stage_name(one), stage_name(other)}
-    return len(names) == 1 or "" in names
+    return len(names) == 1 or bool(names & {"", stage_name(accepted)})
 
 
 def device_name(identity: str) -> str:

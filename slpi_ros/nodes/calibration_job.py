@@ -16,6 +16,7 @@ from slpi_ros.calibration.run import Progress, Recording, Request, aligned, cali
 from slpi_ros.calibration.settings import CalibrationSettings
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.bag_reader import read_bag
+from slpi_ros.io.stage_name import stage_name
 from slpi_ros.nodes.jobs import WorkerProcess
 
 # Topics of a bag. The second one, only in bags of a verification, holds the desired displacement, NaN before and after
@@ -84,6 +85,15 @@ def run_calibration(request: CalibrationRequest, node: Connection) -> Calibratio
     except SlpiError as error:
         return CalibrationOutcome(error=str(error), exit_code=error.exit_code)
     return CalibrationOutcome(format_model(outcome.model), outcome.met, outcome.why)
+
+
+def stage_of_kept(output: Path) -> str:
+    """Return the name of the stage of the first bag in a folder that names one, "" if none does."""
+    for bag in sorted(output.iterdir()):
+        with suppress(SlpiError):
+            if bag.is_dir() and (name := stage_name(read_bag(bag, STATE).hardware_id)):
+                return name
+    return ""
 
 
 def recording_of(output: Path, wanted: Request) -> Recording:

@@ -21,8 +21,9 @@ from slpi_ros.io.bag_files import partial_path
 from slpi_ros.io.bag_writer import BagWriter
 from slpi_ros.io.desired import read_path
 from slpi_ros.io.messages import JointStateEncoder
+from slpi_ros.io.stage_name import same_stage
 from slpi_ros.nodes import parameters as declare
-from slpi_ros.nodes.calibration_job import PATH, STATE, CalibrationJob, CalibrationOutcome, Wanted
+from slpi_ros.nodes.calibration_job import PATH, STATE, CalibrationJob, CalibrationOutcome, Wanted, stage_of_kept
 from slpi_ros.nodes.common import LATCHED, WARN, Diagnostics, Health, request_stop, serve, steady_timer
 from slpi_ros.nodes.guarded_drive import DELIVERY, GuardedDrive
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, limits_of, validated
@@ -54,6 +55,7 @@ DECLARATIONS = declare.read_only(
     Declaration("resume", False, "Whether to go on with the complete bags that output holds already."),
     Declaration("seed", 0, "Seed of the random parts of the drives.", between=(0, 2**31 - 1)),
     declare.STATE_TIMEOUT,
+    declare.ACCEPT_STAGE,
     declare.scalar(
         "patience", 30.0,
         "Seconds to wait for stage_state, for a subscriber of voltage_command and for its other publishers to end.",
@@ -143,7 +145,7 @@ def settings_of(values: Values) -> CalibrationSettings:
         budget=values["budget"] * len(axes),
         target=values["target"] * 1e-6,
         path=_path_of(values["desired_path"], axes, values["rate"]) if values["desired_path"] else {},
-        **{name: values[name] for name in ("rate", "times_repeatability", "seed")},
+        **{name: values[name] for name in ("rate", "times_repeatability", "seed", "accept_stage")},
     )
 
 
@@ -187,6 +189,9 @@ class Calibrator(Node):
         self._settings = settings = settings_of(values)
         self._output, self._patience = Path(values["output"]).absolute(), values["patience"]
         _prepare(self._output, resume=values["resume"])
+        self._kept_stage = stage_of_kept(self._output)
+        if accepted := values["accept_stage"]:
+            self.get_logger().warning(f"what is named stage '{accepted}' is taken for this one (accept_stage)")
         self._guard = GuardedDrive(self, values, on_state=self._on_state)
         self._job: _Job | None = None
         self._worker: CalibrationJob | None = None
@@ -301,23 +306,35 @@ class Calibrator(Node):
     def _start_when_ready(self, now: float) -> None:
         """Start once the stage reports and somebody takes the voltages; fail if that lasts too long."""
         # A publisher that was killed is known for some seconds more.
-        lacking, company = self._guard.lacking(), self._guard.company()
-        found = None if lacking or company else self._guard.found()
+        lacking = self._guard.lacking()
+        found = None if lacking else self._guard.found()
+        overdue = self._guard.overdue()
         if found is not None:
             self._waiting = False
             try:
+                self._require_stage()
                 self._guard.start(found)
             except RecordError as error:
                 self._fail(error)
                 return
             self._returning, self._moved = True, now
             self._worker = CalibrationJob(self._settings, self._output)
+        elif overdue:
+            self._fail(overdue)
         elif now - self._begun > self._patience:
             self._fail(self._guard.not_alone() or RecordError(f"calibrator: for {self._patience:g} s {lacking}"))
         elif now - self._begun > HOLD_PERIOD:
-            lacking = f"{company}; stop it" if company else lacking
             self.get_logger().info(
                 f"waiting, {self._patience:g} s at most: {lacking}", throttle_duration_sec=LOG_PERIOD
+            )
+
+    def _require_stage(self) -> None:
+        """Raise RecordError if the kept bags are of another stage."""
+        kept, present = self._kept_stage, self._guard.hardware_id
+        if not same_stage(kept, present, self._settings.accept_stage):
+            raise RecordError(
+                f"calibrator: the bags in {self._output} are of stage '{kept}', stage_state of '{present}'; choose "
+                "another output, or set accept_stage"
             )
 
     def _on_state(self, data: bytes, clock_ns: int) -> None:

@@ -32,6 +32,7 @@ from slpi_ros.nodes.common import (
     serve,
     steady_timer,
 )
+from slpi_ros.nodes.company import Company
 from slpi_ros.nodes.compensator_diagnostics import Reporter
 from slpi_ros.nodes.compensator_memory import Memory
 from slpi_ros.nodes.compensator_models import Models
@@ -79,13 +80,14 @@ class Compensator(LifecycleNode):
         values = settings.values
         self._controller = controller = Controller(
             values["axes"], settings.limits, values["hardware_id"], settings.time, settings.loops, settings.period,
-            settings.starts,
+            settings.starts, values["accept_stage"],
         )  # fmt: skip
         self._parameter_set.follow(self._use_settings, check=self._check_settings)
         learned_files = f"{values['memory_file']}.learned" if values["memory_file"] else ""
         self._learning = PathLearning(controller, learned_files, lambda count: self._paths.on_forgotten(count))
         self._use_learning(settings)
-        self._reporter = Reporter(self, controller, self._learning, lambda: self._settings)
+        self._company = Company(self, controller)
+        self._reporter = Reporter(self, controller, self._learning, self._company, lambda: self._settings)
         self._memory = Memory(self, controller, values["memory_file"], self._reporter)
         self._paths = Paths(self, controller, self._learning, self._memory, self._reporter)
         self._models = Models(self, controller, self._memory, self._learning, self._reporter)
@@ -102,6 +104,8 @@ class Compensator(LifecycleNode):
         # A simulated clock may stop while the amplifier moves in real time.
         steady_timer(self, values["diagnostic_period"], self._on_period)
         steady_timer(self, WATCH_PERIOD, self._watch)
+        if accepted := values["accept_stage"]:
+            self.get_logger().warning(f"what is named stage '{accepted}' is taken for this one (accept_stage)")
         if values["realtime_priority"]:
             ask_for_priority(self, values["realtime_priority"])
         if values["autostart"]:
@@ -145,6 +149,7 @@ class Compensator(LifecycleNode):
         except SlpiError as error:
             self._models.refuse(error)
             return TransitionCallbackReturn.FAILURE
+        self._company.listen()
         if AUTO in self._settings.starts:
             # Until this node may know whether stage_state has a publisher: commands are not taken before that.
             while not self._is_reported and time.monotonic_ns() - self._begun_ns < DISCOVERY_NS and self.context.ok():
@@ -191,6 +196,7 @@ class Compensator(LifecycleNode):
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:
         """Stop processing messages; hold the present voltages, or ramp to the safe voltages first if configured."""
         self._end_activity()
+        self._company.listen()
         self._reporter.report()
         return super().on_deactivate(state)
 
@@ -244,6 +250,7 @@ class Compensator(LifecycleNode):
         for subscription in self._inputs:
             self.destroy_subscription(subscription)
         self._output.destroy()
+        self._company.close()
 
     # Desired and measured displacements
 
@@ -317,7 +324,8 @@ class Compensator(LifecycleNode):
             state = deserialize_message(data, JointState)
         except RuntimeError:
             return
-        if controller.report(state.name, state.effort, now_ns):
+        self._company.heard(now_ns)
+        if controller.report(state.name, state.effort, now_ns, state.header.frame_id):
             self._reporter.report()
 
     def _locate(self) -> None:
@@ -397,8 +405,6 @@ class Compensator(LifecycleNode):
             self._reporter.report()
 
     def _on_period(self) -> None:
-        configured = not self._reporter.finalized and self._controller.mode is not OperatingMode.UNCONFIGURED
-        self._reporter.others = self._output.others if configured else []
         self._reporter.report()
         self._reporter.start_window()
         if self._controller.active:
@@ -414,6 +420,8 @@ class Compensator(LifecycleNode):
             return
         self._work_off()
         now_ns = time.monotonic_ns()
+        self._company.look(now_ns)
+        self._output.repeat(now_ns)
         before = reporter.quantities.keys(), controller.trajectory.too_fast
         if now_ns - self._looked_ns >= LOOK_NS:
             self._looked_ns = now_ns

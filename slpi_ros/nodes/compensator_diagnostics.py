@@ -16,6 +16,7 @@ from slpi_ros.compensator.statistics import COUNTED, Counts, Timing
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.model.stage_model import StageModel, seconds_since
 from slpi_ros.nodes.common import ERROR, WARN, Diagnostics, Health
+from slpi_ros.nodes.company import Company
 from slpi_ros.nodes.compensator_parameters import CompensatorSettings
 from slpi_ros.nodes.path_learning import OFF, PathLearning
 
@@ -74,17 +75,17 @@ class Reporter:
         node: Node,
         controller: Controller,
         learning: PathLearning,
+        company: Company,
         settings: Callable[[], CompensatorSettings],
     ) -> None:
         self.finalized = False  # the node has been shut down
         self.timing, self.lateness = Timing(), Timing()  # latency of messages; deadline error of trajectory points
         self.last_rejection = "", ""  # cause and reason
         self.model_error = self.model_id = ""  # reason; fingerprint
-        self.others: list[str] = []  # nodes that also publish the voltages
         self.quantities: dict[str, str] = {}  # what is wrong with a quantity that the stage follows
         self.age: float | None = None  # s, of the last answered command by its stamp; None: wanted
         self._out_of_reach = ""
-        self._controller, self._learning, self._settings = controller, learning, settings
+        self._controller, self._learning, self._company, self._settings = controller, learning, company, settings
         self.log, self._diagnostics = Log(node), Diagnostics(node, "compensator")
         self.start_window()
 
@@ -221,6 +222,7 @@ class Reporter:
             "age_of_answered_ms": f"{self.age * 1e3:.3f}" if self.age is not None else "",
             "points_remaining": self._controller.trajectory.remaining,
             "stopped": stopped.value if stopped else "",
+            "obstacle": self._controller.ownership.obstacle[0] if self._controller.ownership.obstacle else "",
             "memory": self._memory(),
         }
 
@@ -270,10 +272,9 @@ class Reporter:
             yield Problem("", WARN, f"{lost} messages lost by the middleware; send fewer, or make its queue deeper")
         if ready and active:
             yield from self._ownership_problems()
-        if self.others:
-            others = ", ".join(self.others)
+        if others := ", ".join(self._company.newcomers):
             said = f"{others} also publishes voltage_command; stop it, or the voltage jumps between both"
-            yield Problem("", WARN, said)
+            yield Problem("others", WARN, said)
         for key, said in self.quantities.items():
             yield Problem(key, WARN, said)
         if too_fast := controller.trajectory.too_fast:

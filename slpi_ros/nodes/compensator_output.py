@@ -12,10 +12,11 @@ from std_msgs.msg import Float64MultiArray
 from trajectory_msgs.msg import JointTrajectory
 
 from slpi_ros.compensator.block import Block
-from slpi_ros.compensator.controller import Controller, watch_uncertainty
+from slpi_ros.compensator.controller import Controller, OperatingMode, watch_uncertainty
+from slpi_ros.compensator.listening import REPEAT_NS
 from slpi_ros.io.cdr import multiarray_header
 from slpi_ros.io.messages import encode_trajectory
-from slpi_ros.nodes.common import COMMANDS, DIAGNOSTICS, publishers_beside
+from slpi_ros.nodes.common import COMMANDS, DIAGNOSTICS
 from slpi_ros.nodes.compensator_diagnostics import Reporter
 from slpi_ros.nodes.compensator_memory import Memory
 
@@ -31,6 +32,7 @@ class Output:
     def __init__(self, node: LifecycleNode, controller: Controller, memory: Memory, reporter: Reporter) -> None:
         self._node, self._controller, self._memory, self._reporter = node, controller, memory, reporter
         self._header = multiarray_header(len(controller.names))
+        self._published, self._published_ns = False, 0  # since the last look; when that was
         self._voltages = node.create_lifecycle_publisher(
             Float64MultiArray, "voltage_command", COMMANDS, qos_overriding_options=OVERRIDABLE
         )
@@ -49,15 +51,20 @@ class Output:
         voltages = self._controller.voltages.tobytes()
         self._memory.note(voltages)
         self._voltages.publish(self._header + voltages)
+        self._published = True
 
     def wait(self) -> None:
         """Wait until the voltages have been delivered: those that have not are lost when the process ends."""
         self._voltages.wait_for_all_acked(PATIENCE)
 
-    @property
-    def others(self) -> list[str]:
-        """The other nodes that publish the voltages."""
-        return publishers_beside(self._node, self._voltages.topic_name)
+    def repeat(self, now_ns: int) -> None:
+        """Publish the voltages again if nothing else was output for some time, so that others hear who commands."""
+        if self._published:
+            self._published, self._published_ns = False, now_ns
+        elif self._published_ns and now_ns - self._published_ns >= REPEAT_NS:
+            repeats = self._controller.ownership.owned and self._controller.mode is not OperatingMode.BLOCK
+            if repeats:
+                self.publish()
 
     def publish_block(self, block: Block) -> None:
         """Publish a block of voltages."""

@@ -30,9 +30,11 @@ DECLARATIONS = (
         "Model document to load; empty: wait for stage_model. A change takes effect at the next configure.",
     ),
     declare.text(
-        "hardware_id", "", "Hardware id of the stage; other models are refused. Empty: any model is accepted.",
+        "hardware_id", "",
+        "Hardware id of the stage: model and stage_state must agree with it. Empty: they must agree with each other.",
         read_only=True,
     ),
+    declare.ACCEPT_STAGE,
     declare.text(
         "model_sha256", "",
         "SHA-256 of the only model document that is accepted, 64 hexadecimal digits: `sha256sum MODEL.json`. "

@@ -5,6 +5,7 @@ import time
 from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 
+from slpi_ros.compensator.block import ACCEPTED, PLAYING
 from slpi_ros.compensator.controller import Controller, OperatingMode, StopReason
 from slpi_ros.compensator.validation import STALE, RejectedError
 from slpi_ros.errors import shown
@@ -92,6 +93,9 @@ class Paths:
 
     def on_block_state(self, status: DiagnosticStatus) -> None:
         """Take what a driver tells of a block."""
+        listening = self._controller.ownership.listening
+        if listening:
+            listening.playing = status.message in (ACCEPTED, PLAYING)
         values = {each.key: each.value for each in status.values}
         seconds, _, rest = values.get("stamp", "").partition(".")
         if not (seconds.isdecimal() and rest.isdecimal() and values.get("sample", "").isdecimal()):

@@ -76,8 +76,6 @@ class ExciterSettings:
 
 # Period of the watch and of messages while it waits, seconds.
 WATCH_PERIOD, LOG_PERIOD = 0.02, 5.0
-# Time without a publisher of stage_state after which rest_voltage is taken for the voltage of the amplifier, seconds.
-NOBODY = 1.0
 # Time to wait at the end for stage_state to report the last voltage, and what such a report must then last
 # for a slow stage to have come all the way, seconds.
 REPORT_PATIENCE, REPORT_LASTS = 3.0, 0.5
@@ -153,7 +151,10 @@ class Exciter(Node):
         now, listeners = time.monotonic(), self._guard.publisher.get_subscription_count()
         if listeners != self._listeners:
             self._listeners, self._same_since = listeners, now
-        if lacking := self._lacking():
+        if error := self._guard.overdue():
+            self._waiting = False
+            self._give_up(error)
+        elif lacking := self._lacking():
             self.get_logger().info(f"waiting: {lacking}", throttle_duration_sec=LOG_PERIOD)
         elif listeners and now - self._same_since >= self._values["settle"]:
             self._waiting = False
@@ -162,8 +163,10 @@ class Exciter(Node):
     def _lacking(self) -> str:
         """Return what is missing before the drive may start, and what to do; "" if nothing is."""
         lacking = self._guard.lacking()
+        if self._guard.stranger():
+            return lacking
         if lacking and self._guard.publisher.get_subscription_count() and not self._guard.heard:
-            if self._values["rest_voltage"] and time.monotonic() - self._begun > NOBODY:
+            if self._values["rest_voltage"]:
                 return ""
             return f"{lacking}; or give rest_voltage, if nothing reports where the amplifier is"
         return lacking

@@ -15,12 +15,15 @@ from std_msgs.msg import Float64MultiArray
 
 from slpi_ros.calibration.drive_monitor import DriveMonitor
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
+from slpi_ros.compensator.listening import graph_known
+from slpi_ros.compensator.monitor import Monitor
+from slpi_ros.compensator.reporters import SoleReporter
 from slpi_ros.errors import RecordError
 from slpi_ros.model.limits import StageLimiter
 from slpi_ros.nodes.common import COMMANDS, nanoseconds, publishers_beside, reliability_of
+from slpi_ros.nodes.company import COMMAND, LEFT_NS, STATE, StateProbe
 from slpi_ros.nodes.parameters import Values, limits_of
 
-STATE, COMMAND = "stage_state", "voltage_command"
 # A voltage is at its goal within this share of the range. Time for the delivery of the last voltage.
 ARRIVED, DELIVERY = 1e-6, Duration(seconds=1.0)
 
@@ -42,6 +45,11 @@ class GuardedDrive:
         self.heard = False  # whether anybody publishes, or has published, states
         self.reported: list[float] | None = None  # V, last valid
         self.hardware_id = ""
+        state = node.resolve_topic_name(STATE)
+        self._reporters = {axis: SoleReporter(axis, lambda: publishers_beside(node, state)) for axis in self._axes}
+        self._identity = Monitor(*self._reporters.values())
+        self._probe = StateProbe(node)
+        self._state_ns = 0  # when the first state was heard
         self.prepare(values)
 
     def prepare(self, values: Values) -> None:
@@ -71,6 +79,7 @@ class GuardedDrive:
             qos = QoSProfile(depth=1000, reliability=reliability_of(publishers))
             self._node.create_subscription(JointState, STATE, self._on_state, qos, raw=True)
             self.heard = True
+        self._probe.poll(self._reporters, time.monotonic_ns())
 
     # Before a drive
 
@@ -90,8 +99,26 @@ class GuardedDrive:
             f"{self._node.get_name()}: {company}; stop it, as the voltage would jump between the commands of both"
         )
 
+    def overdue(self) -> RecordError | None:
+        """Return the error if another node has published the topic of the voltages for longer than a killed one."""
+        return self.not_alone() if time.monotonic_ns() - self._since_ns > LEFT_NS else None
+
+    def stranger(self) -> str:
+        """Return who else commands or reports the stage, or that it is not known yet; "" if nobody does."""
+        if not graph_known(time.monotonic_ns(), self._since_ns, self._state_ns):
+            return "looking who else is there"
+        company = self.company()
+        return f"{company}; stop it" if company else self._second_reporter()
+
+    def _second_reporter(self) -> str:
+        """Return which publishers report the same axis, "" if each is reported by one."""
+        self._identity.check(time.monotonic_ns())
+        return str(next(iter(self._identity.standing), ""))
+
     def lacking(self) -> str:
         """Return what is missing before a drive may start, with what to do; "" if nothing is."""
+        if stranger := self.stranger():
+            return stranger
         topic = self._node.resolve_topic_name(STATE)
         if not self.heard:
             return f"no publisher of {topic}; start the driver of the stage, or remap its topic"
@@ -146,7 +173,7 @@ class GuardedDrive:
 
     def fault(self) -> RecordError | None:
         """Return what speaks against going on with a drive, None if nothing does; call it again and again."""
-        fault = self.monitor.check(time.monotonic_ns())
+        fault = self.monitor.check(time.monotonic_ns()) or self._second_reporter()
         return RecordError(f"{self._node.get_name()}: {fault}") if fault else self.not_alone()
 
     # Return
@@ -193,6 +220,7 @@ class GuardedDrive:
         volts, metres = (dict(zip(state.name, values, strict=False)) for values in (state.effort, state.position))
         v, y = ([float(values.get(axis, math.nan)) for axis in self._axes] for values in (volts, metres))
         clock_ns = self._node.get_clock().now().nanoseconds
+        self._state_ns = self._state_ns or time.monotonic_ns()
         if self.monitor.state(nanoseconds(state.header.stamp), clock_ns, v, y, time.monotonic_ns()):
             self.reported, self.hardware_id = v, state.header.frame_id
             if not self.reports(self.voltages):

@@ -117,6 +117,10 @@ REALTIME_PRIORITY = Declaration(
     "realtime_priority", 0, "SCHED_FIFO priority, 1 to 99, if the system permits; 0: normal scheduling.",
     read_only=True, between=(0, 99),
 )  # fmt: skip
+ACCEPT_STAGE = text(
+    "accept_stage", "", "Name of a stage that is taken for this one, which is told at every start; empty: none.",
+    read_only=True,
+)  # fmt: skip
 # Of simulators.
 SEED = Declaration("seed", 0, "Seed of the random stage and of the noise.", between=(0, 2**53))
 

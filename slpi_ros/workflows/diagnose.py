@@ -37,7 +37,7 @@ class DiagnoseOutcome:
 def diagnose(request: DiagnoseRequest) -> DiagnoseOutcome:
     """Find the causes of the errors of a model."""
     source, model = request.source, request.model
-    records = source.read(coupled=True)
+    records = source.read(coupled=True, stage=model.hardware_id)
     with mismatch_in_data():
         source = replace(source, axes=shared_axes(records, model, source))
         found = require_for_model(records, model, source)

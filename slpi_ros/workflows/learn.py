@@ -71,7 +71,7 @@ def learn(request: LearnRequest) -> LearnOutcome:
     source, model = request.source, request.model
     if request.period is not None and not 0.0 < request.period < math.inf:
         raise UsageError(f"period is {request.period} s; give a positive number of seconds")
-    records = source.read(coupled=True)
+    records = source.read(coupled=True, stage=request.model.hardware_id)
     bags = source.bags if not source.records else [""] * len(records)
     read = sorted(zip(bags, records, strict=True), key=lambda one: int(one[1].time_ns[0]))
     with mismatch_in_data():

@@ -11,6 +11,7 @@ from slpi_ros.identification.record_quality import Finding, assess, findings, re
 from slpi_ros.io.alignment import SeparateTopics
 from slpi_ros.io.bag_reader import read_bag, require_different, require_one_stage
 from slpi_ros.io.record import OUT_OF_ORDER, Course, Record, first_step_back
+from slpi_ros.io.stage_name import same_stage
 from slpi_ros.io.surroundings import clean, named_in
 from slpi_ros.model.sensor import IDEAL, Sensor, corrected
 from slpi_ros.model.stage_model import StageModel
@@ -39,12 +40,25 @@ class Source:
     records: Sequence[Record] = ()
     assessed: bool = False  # `assess_record` has found the axes in use usable already
     surroundings: Sequence[str] | None = None  # recorded quantities, TOPIC[:FIELD]; default: all that can be one
+    accept_stage: str = ""  # name of a stage that is taken for that of the model and the other records
 
-    def read(self, *, coupled: bool = False) -> tuple[Record, ...]:
-        """Return the records; with `coupled`, also axes that are not in use, which may couple into the others."""
+    def read(self, *, coupled: bool = False, stage: str = "") -> tuple[Record, ...]:
+        """Return the records; with `coupled`, also axes that are not in use, which may couple into the others.
+
+        `stage` is the name that a model gives, if there is one.
+        """
         if self.records:
             return tuple(_with_chosen(record, self.surroundings) for record in self.records)
         records = tuple(self._ordered(self._read(str(bag), coupled)) for bag in require_different(self.bags))
+        if self.accept_stage:
+            names = (stage, *(record.hardware_id for record in records))
+            this = next((name for name in names if name and not same_stage(name, self.accept_stage)), self.accept_stage)
+            records = tuple(
+                replace(record, hardware_id=stage or this)
+                if same_stage(record.hardware_id, stage or this, self.accept_stage)
+                else record
+                for record in records
+            )
         require_one_stage(records)
         return records
 

@@ -40,7 +40,7 @@ def refit(request: RefitRequest) -> RefitOutcome:
     model = request.model
     steps: list[RefitStep] = []
     source = request.source.for_model(model)
-    records = sorted(source.read(coupled=True), key=lambda record: int(record.time_ns[0]))
+    records = sorted(source.read(coupled=True, stage=model.hardware_id), key=lambda record: int(record.time_ns[0]))
     for record in records:
         require_for_model([record], model, replace(source, axes=shared_axes([record], model, source)))
     require_followed(records, source, model)

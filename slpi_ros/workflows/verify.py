@@ -51,7 +51,7 @@ def verify(request: VerifyRequest) -> VerifyOutcome:
     """Verify a model."""
     model = request.model
     source = request.source.for_model(model)
-    records = source.read(coupled=True)
+    records = source.read(coupled=True, stage=model.hardware_id)
     desired = None
     if not source.records:
         read = zip(source.bags, records, strict=True)

@@ -26,6 +26,7 @@ class Client:
 
     def __init__(self, graph: Graph, node: NodeProcess, namespace: str, names: Mapping[str, str], desired: Any) -> None:
         self.graph, self.node = graph, node
+        self._present = False
         self.name = f"{namespace}/compensator"
         self._role = f"{self.name}: compensator"
         self._answers = graph.record(
@@ -61,11 +62,25 @@ class Client:
         )
         return status, values_of(status)
 
+    def be_present(self, topic: str) -> None:
+        """Publish states of no axis: where there is a stage, the compensator looks sooner who else commands it."""
+        states = self.graph.node.create_publisher(JointState, topic, RELIABLE)
+        self.graph.node.create_timer(0.02, lambda: states.publish(JointState()))
+        self._present = True
+
     def connect(self, state: str = "active") -> "Client":
         """Wait until nothing that is sent can be lost."""
         self.report("the state", state=state)
+        if state == "active":
+            self.ready()
         if state != "unconfigured":
             self.graph.spin_until(self._wishes.get_subscription_count, "the compensator's ears")
+        return self
+
+    def ready(self) -> "Client":
+        """Wait until the compensator has looked who else is there, if it has a model."""
+        if self._present:
+            self.graph.wait_for_status(self._role, _looked, "the look for others")
         return self
 
     def change_state(self, transition: int) -> bool:
@@ -92,6 +107,7 @@ class Client:
 
     def follow(self, names: Sequence[str], path: np.ndarray, start_ns: int = START_NS) -> np.ndarray:
         """Return the voltages, shape (N, axes), for a path, shape (N, names), of one sample every `PERIOD_NS`."""
+        self.ready()
         before = len(self._answers)
         for i, row in enumerate(path.tolist()):
             self.wish(names, row, start_ns + i * PERIOD_NS)
@@ -118,4 +134,13 @@ def compensator(
     """Start a compensator and stand around it; `names` tells remapped topics."""
     with on_graph() as graph, started("compensator", {**QUICK, **parameters}, *arguments) as node:
         graph.tested = node
-        yield Client(graph, node, namespace, names or {}, desired)
+        client = Client(graph, node, namespace, names or {}, desired)
+        if parameters.get("start_voltage", QUICK["start_voltage"]) not in ("auto", "measured"):
+            client.be_present((names or {}).get("stage_state", f"{namespace}/stage_state"))
+        yield client
+
+
+def _looked(status: Any) -> bool:
+    """Return whether voltages may be output, or there is no model."""
+    values = values_of(status)
+    return not values["model.id"] or values["obstacle"] != "starting"

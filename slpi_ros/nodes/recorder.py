@@ -17,6 +17,8 @@ from slpi_ros.nodes.parameters import Declaration, Parameters, validated
 # Queue length for bursts during slow disk writes.
 DEPTH = 10_000
 DISCOVERY_PERIOD = 0.1
+# What was received is on the disk after this time, seconds; half of a second leaves time for a slow disk.
+SYNC_PERIOD = 0.5
 # Discovery of publishers may take several seconds.
 PATIENCE = 5.0
 STAGE_STATE = "stage_state"
@@ -37,7 +39,8 @@ class Recorder(Node):
 
     Subscribes to the topics named by the parameter ``topics``, with the reliability and durability that their
     publishers offer; messages are not deserialized. An incomplete bag is kept in ``.NAME.partial`` in
-    the folder of the output. Parameters in `DECLARATIONS`.
+    the folder of the output, from which it is read if the recorder was killed: at most its last second is lost.
+    Parameters in `DECLARATIONS`.
     """
 
     def __init__(self) -> None:
@@ -58,6 +61,8 @@ class Recorder(Node):
             if topic.rpartition("/")[2] == STAGE_STATE:
                 self._subscribe(name, JOINT_STATE, ())
         self._discovery = steady_timer(self, DISCOVERY_PERIOD, self._discover)
+        self._synced = 0  # messages on the disk
+        steady_timer(self, SYNC_PERIOD, self._sync)
         if self._duration:
             self._end = steady_timer(self, self._duration + PATIENCE, request_stop)
         self.get_logger().info(f"recording {', '.join(self._awaited)} into {output}")
@@ -119,8 +124,21 @@ class Recorder(Node):
         try:
             self._bag.write(self.get_clock().now().nanoseconds, message, name)
         except RecordError as error:
-            request_stop(RecordError(f"{error}; its unfinished files are in {self._bag.partial}"))
-            self._bag = None
+            self._give_up(self._bag, error)
+
+    def _sync(self) -> None:
+        """Write to the disk what has come since the last call."""
+        if self._bag is None or self._bag.message_count == self._synced:
+            return
+        self._synced = self._bag.message_count
+        try:
+            self._bag.sync()
+        except RecordError as error:
+            self._give_up(self._bag, error)
+
+    def _give_up(self, bag: BagWriter, error: RecordError) -> None:
+        request_stop(RecordError(f"{error}; its unfinished files are in {bag.partial}"))
+        self._bag = None
 
     def _drain(self) -> None:
         """Record the messages still queued in the middleware after the executor has stopped."""

@@ -87,7 +87,7 @@ def feed(recording: Recording, publisher, messages: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("storage", "number"), [("mcap", signal.SIGINT), ("sqlite3", signal.SIGTERM), ("mcap", signal.SIGTERM)]
+    ("storage", "number"), [("mcap", signal.SIGINT), ("sqlite3", signal.SIGTERM), ("mcap", signal.SIGHUP)]
 )
 def test_records_until_a_signal(tmp_path, node, record, storage, number):
     publisher = node.create_publisher(JointState, "stage_state", RELIABLE)
@@ -104,6 +104,24 @@ def test_records_until_a_signal(tmp_path, node, record, storage, number):
     assert read.displacement["x"].tolist() == [row * 1e-9 for row in range(900)]
     assert read.voltage["x"].tolist() == [row * 0.25 for row in range(900)]
     assert set(read.voltage["y"]) == {-1.0}
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_killed_at_any_moment_it_loses_its_last_second_at_most(tmp_path, node, record, storage):
+    publisher = node.create_publisher(JointState, "stage_state", RELIABLE)
+    recording = record(output=tmp_path / "bag", storage=storage)
+    feed(recording, publisher, 1000)
+    # More than the file has without messages, and less than these have.
+    written = tmp_path / ".bag.partial" / "bag" / f"bag.{'mcap' if storage == 'mcap' else 'db3'}"
+    recording.wait_until(lambda: written.stat().st_size > 100_000)
+    for row in range(1000, 1100):
+        publisher.publish(state(row))
+    recording.node.process.kill()
+    assert recording.node.wait() == -signal.SIGKILL
+    read = read_bag(tmp_path / "bag")
+    assert 500 < len(read) <= 1100
+    assert read.displacement["x"].tolist() == [row * 1e-9 for row in range(len(read))]
+    assert read.notes
 
 
 def test_several_topics_each_as_it_is_published(tmp_path, node, record):

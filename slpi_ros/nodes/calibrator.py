@@ -45,12 +45,12 @@ DECLARATIONS = declare.read_only(
     declare.scalar(
         "times_repeatability", 3.0, "Target in multiples of the repeatability, if target is 0.", (0.1, 1e6)
     ),
-    declare.text(
-        "desired_path", "",
+    declare.path(
+        "desired_path",
         "Table (time_s, AXIS_m) or bag with the path that the records must cover, and on which models are verified; at "
         "its rate, range and turns. Empty: random paths. Give a rate at which the path can be sampled.",
     ),
-    declare.text("output", "", "Folder for bags, model, diagnosis and page; required."),
+    declare.path("output", "Folder for bags, model, diagnosis and page; required."),
     Declaration("resume", False, "Whether to go on with the complete bags that output holds already."),
     Declaration("seed", 0, "Seed of the random parts of the drives.", between=(0, 2**31 - 1)),
     declare.STATE_TIMEOUT,

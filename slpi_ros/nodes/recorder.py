@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
+from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
@@ -21,9 +22,11 @@ DISCOVERY_PERIOD = 0.1
 SYNC_PERIOD = 0.5
 # Discovery of publishers may take several seconds.
 PATIENCE = 5.0
+# Shortest time between two of the same warning, seconds.
+LOG_PERIOD = 5.0
 STAGE_STATE = "stage_state"
 DECLARATIONS = declare.read_only(
-    declare.text("output", "", "rosbag2 folder to create; required."),
+    declare.path("output", "rosbag2 folder to create; required."),
     Declaration("topics", [STAGE_STATE], "Topics to record."),
     declare.text("storage", "mcap", "File format: mcap or sqlite3.", *STORAGES),
     declare.scalar(
@@ -70,8 +73,8 @@ class Recorder(Node):
     def destroy_node(self) -> None:
         """Complete the bag, then destroy the node; RecordError if it is empty or cannot be completed."""
         try:
-            if self.context.ok():
-                self._drain()
+            for name in self._listening if self.context.ok() else ():
+                self._drain(name)
             if self._bag is not None:
                 self._finish(self._bag)
         finally:
@@ -108,12 +111,22 @@ class Recorder(Node):
         if former is not None and former.qos_profile == qos:
             return
         if former is not None:
+            self._drain(name)
             self.destroy_subscription(former)
         elif self._bag is not None:
             self._bag.add_topic(name, msgtype)
-        self._listening[name] = self.create_subscription(
-            message_class(name, msgtype), name, partial(self._record, name), qos, raw=True
-        )
+        # rclpy's own one says that no message will come.
+        events = SubscriptionEventCallbacks(incompatible_qos=partial(self._adapt, name), use_default_callbacks=False)
+        subscribe = partial(self.create_subscription, message_class(name, msgtype), name)
+        try:
+            self._listening[name] = subscribe(partial(self._record, name), qos, raw=True, event_callbacks=events)
+        except UnsupportedEventTypeError:
+            self._listening[name] = subscribe(partial(self._record, name), qos, raw=True)
+
+    def _adapt(self, name: str, _: object) -> None:
+        """Subscribe anew with a QoS that a further publisher offers, too."""
+        self._awaited.setdefault(name, name)
+        self._discovery.reset()
 
     def _record(self, name: str, message: bytes) -> None:
         if self._bag is None:
@@ -121,8 +134,15 @@ class Recorder(Node):
         if self._duration and not self._bag.message_count:
             self.destroy_timer(self._end)
             self._end = steady_timer(self, self._duration, request_stop)
+        now_ns = self.get_clock().now().nanoseconds
+        if not now_ns:
+            self.get_logger().warning(
+                "use_sim_time is set and nobody publishes /clock: messages are recorded at time 0; start what "
+                "publishes it, or leave use_sim_time out",
+                throttle_duration_sec=LOG_PERIOD,
+            )
         try:
-            self._bag.write(self.get_clock().now().nanoseconds, message, name)
+            self._bag.write(now_ns, message, name)
         except RecordError as error:
             self._give_up(self._bag, error)
 
@@ -140,16 +160,16 @@ class Recorder(Node):
         request_stop(RecordError(f"{error}; its unfinished files are in {bag.partial}"))
         self._bag = None
 
-    def _drain(self) -> None:
-        """Record the messages still queued in the middleware after the executor has stopped."""
-        for name, subscription in self._listening.items():
-            with subscription.handle:
-                # Limited, so that continuous publishing cannot delay the end.
-                for _ in range(DEPTH):
-                    taken = subscription.handle.take_message(subscription.msg_type, True)
-                    if taken is None:
-                        break
-                    self._record(name, taken[0])
+    def _drain(self, name: str) -> None:
+        """Record the messages of a topic that are still queued in the middleware."""
+        subscription = self._listening[name]
+        with subscription.handle:
+            # Limited, so that continuous publishing cannot delay the end.
+            for _ in range(DEPTH):
+                taken = subscription.handle.take_message(subscription.msg_type, True)
+                if taken is None:
+                    break
+                self._record(name, taken[0])
 
     def _finish(self, bag: BagWriter) -> None:
         """Close the bag and move it to its final path; RecordError if it is empty."""

@@ -135,17 +135,52 @@ def test_several_topics_each_as_it_is_published(tmp_path, node, record):
     recording.wait_until(lambda: late.get_subscription_count() and latched.get_subscription_count())
     late.publish(Float64(data=21.5))
     assert all(reliable.wait_for_all_acked(rclpy.duration.Duration(seconds=PATIENCE_S)) for reliable in (late, latched))
-    # a recorder that insisted on reliable messages would get none of these
+    # a recorder that insisted on reliable messages would get none of these, and rclpy says so while it does
     for row in range(50):
         states.publish(state(row))
         time.sleep(0.02)
-    assert recording.end(signal.SIGINT)[0] == 0
+    code, said = recording.end(signal.SIGINT)
+    assert code == 0 and "No messages" not in said
     assert 0 < len(read_bag(tmp_path / "bag", "/lab/state")) <= 50
     with (tmp_path / "bag" / "bag.mcap").open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         rows = [(channel.topic, message) for _, channel, _, message in reader.iter_decoded_messages()]
     assert [message.data for topic, message in rows if topic == "/lab/stage_model"] == ["latched before"]
     assert [message.data for topic, message in rows if topic == "/lab/temperature"] == [21.5]
+
+
+def test_a_further_publisher_of_another_quality_is_recorded_too(tmp_path, node, record):
+    first = node.create_publisher(JointState, "stage_state", RELIABLE)
+    recording = record(output=tmp_path / "bag")
+    feed(recording, first, 100)
+    second = node.create_publisher(JointState, "stage_state", qos_profile_sensor_data)
+    recording.wait_until(lambda: second.get_subscription_count() > 0)
+    for row in range(100, 150):
+        second.publish(state(row))
+        time.sleep(0.02)
+    assert recording.end(signal.SIGINT)[0] == 0
+    read = read_bag(tmp_path / "bag")
+    assert read.displacement["x"][:100].tolist() == [row * 1e-9 for row in range(100)]
+    assert len(read) > 100
+    assert "No messages" not in recording.node.stderr
+
+
+def test_a_simulated_clock_that_nobody_publishes_is_told(tmp_path, node, record):
+    publisher = node.create_publisher(JointState, "stage_state", RELIABLE)
+    recording = record(output=tmp_path / "bag", use_sim_time="true")
+    feed(recording, publisher, 10)
+    code, said = recording.end(signal.SIGINT)
+    assert code == 0 and holds(said, "use_sim_time", "/clock")
+    assert len(read_bag(tmp_path / "bag")) == 10
+
+
+def test_the_home_folder_is_put_in_for_its_sign(tmp_path, node, record, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    publisher = node.create_publisher(JointState, "stage_state", RELIABLE)
+    recording = record(output="~/bag")
+    feed(recording, publisher, 10)
+    assert recording.end(signal.SIGINT)[0] == 0
+    assert len(read_bag(tmp_path / "bag")) == 10
 
 
 def test_duration(tmp_path, node, record):

@@ -21,6 +21,7 @@ from slpi_ros.io.bag_writer import BagWriter
 from slpi_ros.io.desired import read_path
 from slpi_ros.io.messages import JointStateEncoder
 from slpi_ros.io.unfinished_bags import partial_path
+from slpi_ros.model.limits import volts
 from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.calibration_job import PATH, STATE, CalibrationJob, CalibrationOutcome, Wanted
 from slpi_ros.nodes.common import LATCHED, WARN, Diagnostics, Health, request_stop, serve, steady_timer
@@ -217,7 +218,8 @@ class Calibrator(Node):
         if self.context.ok() and self._guard.started:
             self._returning = True
             self._guard.return_to(self._settings.rest)
-        self._fail(Interrupted("calibrator: ended by a signal"))
+        left = f", at {volts(*self._guard.voltages)} V" if self._guard.started else "; nothing was moved"
+        self._fail(Interrupted(f"calibrator: ended by a signal{left}"))
         self._end_job()
         super().destroy_node()
         if not ended and self._failure is not None:

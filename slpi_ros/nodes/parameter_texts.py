@@ -42,7 +42,7 @@ def _written(arguments: Sequence[str]) -> Texts:
     for file, content in _files(arguments):
         for number, line in enumerate(content.splitlines(), start=1):
             if found := _LINE.fullmatch(line):
-                yield f"{file}, line {number}", *found.groups()
+                yield f"{file}, line {number}", found[1], found[2]
 
 
 def leading_zeros(arguments: Sequence[str]) -> Iterator[str]:

@@ -114,7 +114,8 @@ def _run(options: Namespace) -> Result:
         lines, details, verdict = [verdict, *table, *lines], [verdict, *table, *details], ""
     well = not any(check.level == FAILED for check in checks)
     if not well:
-        next_command = worst_first(checks)[0].remedy
+        failed = [check for check in worst_first(checks) if check.level == FAILED]
+        next_command = next((check for check in failed if "; " in check.text), failed[0]).remedy
     elif options.device:
         next_command = "ros2 run slpi_ros driver --ros-args --params-file driver.yaml"
     elif options.bags and model is None:

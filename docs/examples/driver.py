@@ -16,8 +16,8 @@ LOWEST_V, HIGHEST_V = 0.0, 100.0
 class Driver(Node):
     def __init__(self):
         super().__init__("driver")
-        self.device, self.voltage = Device(), LOWEST_V
-        self.device.write(self.voltage)
+        self.device = Device()
+        self.voltage = self.device.applied()  # nothing moves at the start
         self.publisher = self.create_publisher(JointState, "stage_state", 100)
         self.create_subscription(Float64MultiArray, "voltage_command", self.on_command, 100)
         self.create_timer(PERIOD_S, self.publish_state)

@@ -16,6 +16,7 @@ from typing import Any, NoReturn
 
 from slpi_ros.cli import (
     calibrate,
+    call,
     compensate,
     diagnose,
     doctor,
@@ -26,6 +27,7 @@ from slpi_ros.cli import (
     identify,
     import_,
     learn,
+    param,
     refit,
     show,
     simulate,
@@ -51,6 +53,8 @@ COMMANDS: Mapping[str, Command] = {
     "learn": learn.COMMAND,
     "export": export.COMMAND,
     "doctor": doctor.COMMAND,
+    "call": call.COMMAND,
+    "param": param.COMMAND,
     "calibrate": calibrate.COMMAND,
     "experiments": experiments.COMMAND,
     "show": show.COMMAND,

@@ -65,6 +65,7 @@ def _run(options: Namespace) -> Result:
         check_record,
         described,
         doctor_document,
+        worst_first,
     )
 
     limits = None
@@ -113,8 +114,8 @@ def _run(options: Namespace) -> Result:
         lines, details, verdict = [verdict, *table, *lines], [verdict, *table, *details], ""
     well = not any(check.level == FAILED for check in checks)
     if not well:
-        more = [*(["--model", options.model] if model else []), *(["--device", options.device] if table else [])]
-        next_command = command_line("slpi", "doctor", *options.bags, *more)
+        failed = [check for check in worst_first(checks) if check.level == FAILED]
+        next_command = next((check for check in failed if "; " in check.text), failed[0]).remedy
     elif options.device:
         next_command = "ros2 run slpi_ros driver --ros-args --params-file driver.yaml"
     elif options.bags and model is None:

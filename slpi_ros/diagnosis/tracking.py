@@ -25,13 +25,18 @@ CAUSES = {
     "zero": "the zero has moved since the model was identified, or the path counts from another one: ~/set_zero",
     "memory": "the stage was in another state than the compensator assumed: ~/reset_memory",
     "limits": "the voltage was at a limit: a smaller path",
-    "delay": "the stage is late: send the path as a trajectory, with the delay in the model",
+    "delay": "the stage is later than its model: a delay is found by slpi diagnose; a model with it sends ahead by it "
+    "what is known of the path, so as a trajectory",
     "rate": "loops wider or narrower than those of the model, the faster the more: slpi diagnose on faster records",
     "command": "the voltages are not those of this model: slew limit, feedback, a reset, another model, or a computer "
     "that was busy, which the log of the compensator tells",
     "model": "the hysteresis and what else the model does not hold: slpi diagnose, slpi refit",
     "noise": "what does not repeat: sensor noise, vibration, line interference",
 }
+LATE = (
+    "the voltages are late: single messages act when they come, the points of a trajectory at their times; or else the "
+    "slew limit, a driver that buffers, or stamps that are not the times meant"
+)
 VARYING = "the voltages come late, and not always equally: computer or driver was busy, or the slew limit was reached"
 
 
@@ -109,6 +114,7 @@ class Tracking:
     t: FloatArray  # s, (N,)
     desired: FloatArray  # m, (N,)
     parts: Mapping[str, FloatArray]  # m, (N,), of each cause, with noise in "model"
+    behind: float = 0.0  # s, of `delay`, by which the stage is later than its model
     delays: tuple[float, ...] | None = None  # s, range of a delay that varies: 5th and 95th percentile
 
     @property
@@ -134,7 +140,9 @@ class Tracking:
 
     def advice(self, cause: str) -> str:
         """Return what a cause is, and what helps."""
-        return VARYING if self.delays and cause == "delay" else CAUSES[cause]
+        if cause != "delay":
+            return CAUSES[cause]
+        return VARYING if self.delays else LATE if 2.0 * self.behind < self.delay else CAUSES[cause]
 
     def to_document(self) -> dict[str, Any]:
         """Return the figures as in ``msg_schemas/verification.schema.json``."""
@@ -210,6 +218,7 @@ def track(
         error=ErrorPart.of(where[0], error),
         shares={cause: shares[cause] for cause in CAUSES},
         delay=delay + behind,
+        behind=behind,
         t=t,
         desired=d,
         parts=parts,

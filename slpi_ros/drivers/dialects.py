@@ -107,7 +107,7 @@ def dialect_of(name: str) -> Dialect:
     with dependencies_needed():
         import yaml
     try:
-        content = yaml.safe_load(Path(name).read_text(encoding="utf-8"))
+        content = yaml.safe_load(Path(name).expanduser().read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
         raise UsageError(f"dialect {name}: it cannot be read: {' '.join(str(error).split())}") from error
     try:

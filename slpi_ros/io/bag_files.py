@@ -24,6 +24,7 @@ from slpi_ros.io.input_limits import (
     read_input,
     require_inputs,
 )
+from slpi_ros.io.unfinished_bags import abandoned_in, is_being_written, partial_path
 
 SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 # The parts of a split bag end in their number.
@@ -39,18 +40,16 @@ PATIENCE = 120.0
 _BLOCK = 2**20
 
 
-def partial_path(path: str | os.PathLike[str]) -> Path:
-    """Return the folder that contains the bag of this path until it is complete."""
-    path = Path(path)
-    return path.with_name(f".{path.name}.partial")
-
-
 def locate(path: Path) -> list[Path]:
     """Return the paths to open for a bag: a folder with metadata, or its bag files in order; RecordError if none."""
+    # A killed recorder leaves a bag in its partial folder, which may be named by either.
+    partial = path if path.is_dir() or not path.name else partial_path(path)
+    if (left := abandoned_in(partial)) and (path == partial or not path.exists()):
+        path = left
     if not path.exists():
         hint = _WANTED
-        if path.name and partial_path(path).exists():
-            hint = f"its recording is unfinished, in {partial_path(path)}: wait for the recorder to end"
+        if path.name and is_being_written(partial):
+            hint = f"its recording is unfinished, in {partial}: wait for the recorder to end"
         raise RecordError(f"{path}: no such bag; {hint}")
     if path.is_file():
         if path.name.endswith(SUFFIXES):
@@ -259,7 +258,8 @@ class BagWatch:
 def _finished(path: Path) -> int | None:
     """Return the time (ns) at which a bag was completed; None if `path` is no bag or is still being written."""
     if path.name.startswith("."):
-        return None
+        left = abandoned_in(path) if path.is_dir() else None
+        return max(file.stat().st_mtime_ns for file in left.iterdir()) if left else None
     metadata = path / "metadata.yaml"
     if path.is_dir():
         return metadata.stat().st_mtime_ns if metadata.is_file() and metadata.stat().st_size else None

@@ -23,6 +23,7 @@ from slpi_ros.io.messages import JOINT_STATE, MESSAGE_TYPES, QUANTITY_TYPES, SEC
 from slpi_ros.io.record import BLOCK, Course, Record, each_block, new_column, order_note, release
 from slpi_ros.io.stage_name import stage_name
 from slpi_ros.io.surroundings import MOST, Chosen, courses, since_start_of, topics_beside, wild
+from slpi_ros.io.unfinished_bags import NOTE, completed, is_abandoned
 
 _Path = str | os.PathLike[str]
 
@@ -70,10 +71,12 @@ def read_bag(
             displacement = bag.read(topic.displacement, MESSAGE_TYPES)
             record = combine(voltage, displacement, topic, axes or (), path)
             taken = [bag.full_name(name) for name in (topic.displacement, topic.voltage)]
-            return _with_surroundings(record, bag, displacement, taken, surroundings)
-        state = bag.read(topic, (JOINT_STATE,))
-        record = _record_of(state, _choose_axes(state, axes, f"{path}, topic '{topic}'"), path)
-        return _with_surroundings(record, bag, state, [bag.full_name(topic)], surroundings)
+            record = _with_surroundings(record, bag, displacement, taken, surroundings)
+        else:
+            state = bag.read(topic, (JOINT_STATE,))
+            record = _record_of(state, _choose_axes(state, axes, f"{path}, topic '{topic}'"), path)
+            record = _with_surroundings(record, bag, state, [bag.full_name(topic)], surroundings)
+        return replace(record, notes=(*record.notes, *bag.notes))
 
 
 def _record_of(state: Signals, chosen: Sequence[str], path: Path) -> Record:
@@ -164,21 +167,24 @@ class Bag:
         self._counts: Counter[str] = Counter()
         self._storages: list[tuple[Any, Path]] = []
         self._stack = ExitStack()
+        self.notes: tuple[str, ...] = ()  # what is to be told of the bag as a whole
 
     def __enter__(self) -> Self:
         with ExitStack() as stack:
             for source in self._sources:
                 with translated(source):
-                    require_bounded(source)
-                    self._open(source, stack)
+                    whole = stack.enter_context(completed(source))
+                    self.notes = (NOTE,) if is_abandoned(source) else ()
+                    require_bounded(whole)
+                    self._open(whole, source, stack)
             self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def _open(self, source: Path, stack: ExitStack) -> None:
-        reader = stack.enter_context(Reader(stack.enter_context(unpacked(source))))
+    def _open(self, whole: Path, source: Path, stack: ExitStack) -> None:
+        reader = stack.enter_context(Reader(stack.enter_context(unpacked(whole))))
         for connection in reader.connections:
             # They are not checked by the reader of metadata.yaml.
             for name, value in (("name", connection.topic), ("type", connection.msgtype)):

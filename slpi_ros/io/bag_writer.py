@@ -12,15 +12,17 @@ from typing import Any, Literal, Self
 
 import numpy as np
 from rosbags.rosbag2 import StoragePlugin, Writer, WriterError
+from rosbags.rosbag2.storage_mcap import McapWriter
 from rosbags.typesys import Stores, TypesysError, get_typestore
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import RecordError, UsageError
-from slpi_ros.io.bag_files import absolute_name, one_line, partial_path
+from slpi_ros.io.bag_files import absolute_name, one_line
 from slpi_ros.io.cdr import float64
 from slpi_ros.io.desired import DESIRED
 from slpi_ros.io.messages import FLOAT64, JOINT_STATE, encode_joint_states
 from slpi_ros.io.record import Record
+from slpi_ros.io.unfinished_bags import claim, is_being_written, partial_path
 
 STORAGES = {"mcap": StoragePlugin.MCAP, "sqlite3": StoragePlugin.SQLITE3}
 
@@ -32,8 +34,9 @@ class BagWriter:
     """Write a rosbag2 folder; a context manager, which an exception makes discard the bag."""
 
     # An incomplete bag is in ``.NAME.partial`` next to the final `path`, so a folder at the final path is always a
-    # complete bag. ``write`` writes to `topic` by default, of type ``sensor_msgs/JointState``; None if all are added
-    # with ``add_topic``. With `replace`, a folder at this path is deleted once the new bag is complete.
+    # complete bag; `sync` bounds what is lost of it when the process is killed. ``write`` writes to `topic` by default,
+    # of type ``sensor_msgs/JointState``; None if all are added with ``add_topic``. With `replace`, a folder at this
+    # path is deleted once the new bag is complete.
     def __init__(
         self,
         path: str | os.PathLike[str],
@@ -54,11 +57,12 @@ class BagWriter:
         if os.path.lexists(self.path) and not replace:
             raise RecordError(f"{path}: exists already; choose another name, or remove it first")
         if self.partial.exists():
+            remedy = "wait for its recorder" if is_being_written(self.partial) else f"slpi reads it as {path}"
             raise RecordError(
-                f"{self.partial}: an unfinished bag of the same name; wait for its recorder, or, if that was "
-                "killed, move the folder away (mcap files can be saved with `mcap recover`)"
+                f"{self.partial}: an unfinished bag of the same name; {remedy}, or choose another name for the new one"
             )
         try:
+            self._lock = claim(self.partial)
             self._writer = Writer(self.partial / self.path.name, version=_BAG_VERSION, storage_plugin=STORAGES[storage])
             self._writer.open()
         except _WRITE_ERRORS as error:
@@ -90,6 +94,20 @@ class BagWriter:
             raise self._failure(error) from error
         self.message_count += 1
 
+    def sync(self) -> None:
+        """Write the messages so far to the disk, where they stay if the process is killed or the power fails."""
+        storage: Any = self._writer.storage
+        try:
+            if not isinstance(storage, McapWriter):
+                storage.conn.commit()
+                return
+            if storage.chunk.msgs:
+                storage.close_chunk()
+            storage.bio.flush()
+            os.fsync(storage.bio.fileno())
+        except _WRITE_ERRORS as error:
+            raise self._failure(error) from error
+
     def close(self) -> None:
         """Complete the bag and move it to its final path; if it cannot be written, the partial folder remains."""
         try:
@@ -100,6 +118,7 @@ class BagWriter:
             (self.partial / self.path.name).rename(self.path)
             shutil.rmtree(before, ignore_errors=True)
             self.partial.rmdir()
+            os.close(self._lock)
         except _WRITE_ERRORS as error:
             raise self._failure(error) from error
 
@@ -109,6 +128,8 @@ class BagWriter:
         with suppress(*_WRITE_ERRORS):
             self._writer.abort()
         shutil.rmtree(self.partial, ignore_errors=True)
+        with suppress(OSError):
+            os.close(self._lock)
 
     def __enter__(self) -> Self:
         return self

@@ -17,11 +17,12 @@ from slpi_ros.calibration.run import Progress
 from slpi_ros.calibration.settings import CalibrationSettings
 from slpi_ros.errors import RecordError, SlpiError, UsageError, length
 from slpi_ros.io.atomic_file import make_folder
-from slpi_ros.io.bag_files import partial_path
 from slpi_ros.io.bag_writer import BagWriter
 from slpi_ros.io.desired import read_path
 from slpi_ros.io.messages import JointStateEncoder
 from slpi_ros.io.stage_name import same_stage
+from slpi_ros.io.unfinished_bags import partial_path
+from slpi_ros.model.limits import volts
 from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.calibration_job import PATH, STATE, CalibrationJob, CalibrationOutcome, Wanted, stage_of_kept
 from slpi_ros.nodes.common import LATCHED, WARN, Diagnostics, Health, request_stop, serve, steady_timer
@@ -46,12 +47,12 @@ DECLARATIONS = declare.read_only(
     declare.scalar(
         "times_repeatability", 3.0, "Target in multiples of the repeatability, if target is 0.", (0.1, 1e6)
     ),
-    declare.text(
-        "desired_path", "",
+    declare.path(
+        "desired_path",
         "Table (time_s, AXIS_m) or bag with the path that the records must cover, and on which models are verified; at "
         "its rate, range and turns. Empty: random paths. Give a rate at which the path can be sampled.",
     ),
-    declare.text("output", "", "Folder for bags, model, diagnosis and page; required."),
+    declare.path("output", "Folder for bags, model, diagnosis and page; required."),
     Declaration("resume", False, "Whether to go on with the complete bags that output holds already."),
     Declaration("seed", 0, "Seed of the random parts of the drives.", between=(0, 2**31 - 1)),
     declare.STATE_TIMEOUT,
@@ -222,7 +223,8 @@ class Calibrator(Node):
         if self.context.ok() and self._guard.started:
             self._returning = True
             self._guard.return_to(self._settings.rest)
-        self._fail(Interrupted("calibrator: ended by a signal"))
+        left = f", at {volts(*self._guard.voltages)} V" if self._guard.started else "; nothing was moved"
+        self._fail(Interrupted(f"calibrator: ended by a signal{left}"))
         self._end_job()
         super().destroy_node()
         if not ended and self._failure is not None:

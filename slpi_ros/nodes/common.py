@@ -33,6 +33,7 @@ from trajectory_msgs.msg import JointTrajectory
 from slpi_ros.errors import RecordError, SlpiError, UsageError, shown
 from slpi_ros.io.messages import SECOND_NS, TrajectoryArrays, decode_trajectory
 from slpi_ros.nodes import stop
+from slpi_ros.nodes.parameter_texts import remedy
 from slpi_ros.nodes.stop import Stop
 
 COMMANDS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
@@ -313,7 +314,8 @@ def _live(make_node: Callable[[], Node], kind: str) -> None:
         rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
         node = make_node()
     except START_ERRORS as error:
-        raise UsageError(f"the node cannot start: {' '.join(str(error).split())}") from error
+        said = f"the node cannot start: {' '.join(str(error).split())}"
+        raise UsageError("; ".join(filter(None, [said, remedy(sys.argv, str(error))]))) from error
     try:
         executor = make_executor(getattr(node, "executor_kind", kind))
         executor.add_node(node)

@@ -279,6 +279,7 @@ class Compensator(LifecycleNode):
         stamp_ns, names, displacements = self._measured.read(data) or as_rclpy_reads(data)
         age_ns = self.get_clock().now().nanoseconds - stamp_ns if stamp_ns else 0
         fresh = -EARLIEST_NS <= age_ns <= OLDEST_NS
+        self._reporter.measured += 1
         if self._learning.passes.on and fresh:
             self._learning.passes.read(names, displacements, self._paths.clocks()[1] - age_ns)
         try:

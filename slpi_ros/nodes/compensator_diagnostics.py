@@ -85,6 +85,8 @@ class Reporter:
         self.quantities: dict[str, str] = {}  # what is wrong with a quantity that the stage follows
         self.age: float | None = None  # s, of the last answered command by its stamp; None: wanted
         self._out_of_reach = ""
+        self.measured = 0  # messages with measured displacements
+        self._disturbed = -math.inf  # the number of them when the computer was busy last
         self._controller, self._learning, self._company, self._settings = controller, learning, company, settings
         self.log, self._diagnostics = Log(node), Diagnostics(node, "compensator")
         self.start_window()
@@ -195,23 +197,26 @@ class Reporter:
         yet = "" if watchdog.commanded else " yet"
         return f"no command{yet} for {watchdog.silence(time.monotonic_ns()):.3g} s; voltages {reaction}"
 
-    def _late(self) -> str:
-        """Return what a trajectory lost since the last periodic report, and why; "" if nothing."""
+    def _late(self) -> tuple[str, bool]:
+        """Return what a trajectory lost since the last periodic report, "" if nothing; whether by a busy computer."""
         trajectory, report = self._controller.trajectory, self.lateness.report()
         skipped, crowded = self._since("points_skipped"), self._since("points_crowded")
         points = "1 point" if skipped == 1 else f"{skipped} points"
         said = f"{points} of a trajectory skipped, as the next one was already due"
         if 2 * crowded > skipped:
             period = f"{trajectory.period * 1e3:.3g} ms"
-            return f"{said}: they are closer together than the output period of {period}; send points {period} apart"
+            return (
+                f"{said}: they are closer together than the output period of {period}; send points {period} apart",
+                False,
+            )
         latest = report.latency[2] if report else 0.0
         if not skipped and latest < LATE:
-            return ""
+            return "", False
         late = f"trajectory up to {latest * 1e3:.3g} ms late"
         return (
             f"{f'{said}, ' if skipped else ''}{late}: the computer was busy; the path has an error there, end other "
             "programs, lower output_rate, or set realtime_priority"
-        )
+        ), True
 
     def _counters(self) -> dict[str, object]:
         counts, stopped = self._counts(), self._controller.stopped
@@ -266,8 +271,10 @@ class Reporter:
         if points := since("points_held_at_limit"):
             said = f"{points} points of a trajectory held at a voltage limit: {self._out_of_reach}"
             yield Problem("held", WARN, said)
-        if late := self._late():
+        late, busy = self._late()
+        if late:
             yield Problem("late", WARN, late)
+        self._disturbed = self.measured if busy else self._disturbed
         if lost := since("messages_lost"):
             yield Problem("", WARN, f"{lost} messages lost by the middleware; send fewer, or make its queue deeper")
         if ready and active:
@@ -286,7 +293,8 @@ class Reporter:
             if beyond and axis.name not in self._beyond_before:
                 advice = "errors may be larger than told, record at that rate (slpi excite --for-path)"
                 yield Problem(f"{axis.name} beyond", WARN, f"axis '{axis.name}': {beyond}; {advice}")
-            for kind, level, text in _axis_problems(axis, settings.values["drift_alarm"], moving):
+            alarm, since_busy = settings.values["drift_alarm"], self.measured - self._disturbed
+            for kind, level, text in _axis_problems(axis, alarm, moving, since_busy):
                 yield Problem(f"{axis.name} {kind}" if kind else "", level, f"axis '{axis.name}'{text}")
         for name, progress in self._learning.progress.items():
             if progress.held:
@@ -329,8 +337,8 @@ def _axis_values(axis: Axis, created: str) -> dict[str, object]:
     return {f"{axis.name}.{key}": value for key, value in values.items()}
 
 
-def _axis_problems(axis: Axis, factor: float, moving: bool) -> Iterator[Problem]:
-    """Yield the problems of an axis; the texts go on behind its name."""
+def _axis_problems(axis: Axis, factor: float, moving: bool, since_busy: float) -> Iterator[Problem]:
+    """Yield the problems of an axis, `since_busy` measurements after the computer was; texts go on behind its name."""
     loop, drift, quality = axis.loop, axis.loop.drift, axis.model.quality if axis.model else None
     if moving and loop.state == "holding":
         yield Problem("", WARN, ": feedback holds, measurement too old")
@@ -352,7 +360,7 @@ def _axis_problems(axis: Axis, factor: float, moving: bool) -> Iterator[Problem]
         if 0.0 < factor * usual < drift.rms:
             text = (
                 f" is off its model by {drift.rms * 1e9:.1f} nm rms, mean {drift.mean * 1e9:.1f} nm, in "
-                f"{drift.samples} measurements; held-out error {usual * 1e9:.1f} nm: {remedy(axis, drift)}"
+                f"{drift.samples} measurements; held-out error {usual * 1e9:.1f} nm: {remedy(axis, drift, since_busy)}"
             )
             yield Problem("", WARN, text)
 
@@ -371,8 +379,10 @@ def _learning_values(learning: PathLearning) -> dict[str, object]:
     return values
 
 
-def remedy(axis: Axis, drift: Drift) -> str:
-    """Return what to do about residuals: what has been done already is not advised again."""
+def remedy(axis: Axis, drift: Drift, since_busy: float = math.inf) -> str:
+    """Return what to do about residuals, `since_busy` measurements after the computer was: nothing that is done."""
+    if since_busy < drift.samples:
+        return "the computer was busy meanwhile, and readings came late: look again when it is not"
     if axis.confidence.state not in (KNOWN, RESTORED):
         # What an assumed memory adds is no vibration.
         rest = NO_CONSTANT * drift.rms > abs(drift.mean)

@@ -25,8 +25,8 @@ DEFAULT_CORRECTION = 0.2
 
 DECLARATIONS = (
     declare.AXES,
-    declare.text(
-        "model_file", "",
+    declare.path(
+        "model_file",
         "Model document to load; empty: wait for stage_model. A change takes effect at the next configure.",
     ),
     declare.text(
@@ -131,7 +131,7 @@ DECLARATIONS = (
         "reset_to", "present", "Final voltage of reset_memory: present (before the reset) or safe (safe_voltage).",
         "present", "safe",
     ),
-    declare.text("memory_file", "", "File that stores the memory for the next start; empty: none.", read_only=True),
+    declare.path("memory_file", "File that stores the memory for the next start; empty: none.", read_only=True),
     # Feedback
     Declaration("feedback", False, "Whether PID feedback of measured_displacement corrects the voltage."),
     declare.each_axis("kp", 0.0, "Proportional gain of the feedback, V/m.", GAIN),

@@ -7,9 +7,7 @@ from contextlib import suppress
 from typing import Any
 
 import numpy as np
-import rclpy
 from rcl_interfaces.srv import GetParameters
-from rclpy.context import Context
 from rclpy.executors import SingleThreadedExecutor
 from rclpy.node import Node
 from rclpy.parameter import parameter_value_to_python
@@ -17,10 +15,11 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
-from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.document import parse_model
-from slpi_ros.nodes.common import LATCHED, START_ERRORS, full_name, reliability_of
+from slpi_ros.nodes.common import LATCHED, full_name, reliability_of
+from slpi_ros.nodes.graph_calls import joined
 from slpi_ros.nodes.parameters import numbers
 from slpi_ros.reports.doctor import STATE_TYPE, Graph
 
@@ -33,21 +32,8 @@ DEPTH = 1000
 
 def probe(state_topic: str, command_topic: str, namespace: str, seconds: float) -> Graph:
     """Watch a running graph for some `seconds`, without publishing anything; topics are relative to `namespace`."""
-    context = Context()
-    try:
-        rclpy.init(args=[], context=context)
-        node = rclpy.create_node("slpi_doctor", namespace=namespace or None, context=context)
-        executor = SingleThreadedExecutor(context=context)
-        executor.add_node(node)
-        try:
-            return _Probe(node, executor, state_topic, command_topic).watch(seconds)
-        finally:
-            executor.shutdown()
-            node.destroy_node()
-    except START_ERRORS as error:
-        raise UsageError(f"ROS cannot start: {' '.join(str(error).split())}") from None
-    finally:
-        context.try_shutdown()
+    with joined("slpi_doctor", namespace) as (node, executor):
+        return _Probe(node, executor, state_topic, command_topic).watch(seconds)
 
 
 class _Probe:

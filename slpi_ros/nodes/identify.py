@@ -37,13 +37,14 @@ from slpi_ros.nodes.parameters import Declaration, Parameters, Values, validated
 
 ANY_TIME = (-math.inf, math.inf)
 DECLARATIONS = (
-    Declaration(
-        "bags", [""],
+    declare.path(
+        "bags",
         "Bags to identify in one fit: rosbag2 folders, or single mcap or db3 files. A later change of a parameter "
         "repeats the identification.",
+        [""],
     ),
-    declare.text(
-        "watch_directory", "",
+    declare.path(
+        "watch_directory",
         "Watched folder: the newest complete bag and every bag completed later are identified, unless recorded on "
         "another stage than the published model; empty: none.",
     ),
@@ -54,7 +55,7 @@ DECLARATIONS = (
         "follows; empty: none, and for ~/diagnose every one that the bag holds.",
     ),
     declare.text("kind", "slpi", f"Kind of hysteresis model: {', '.join(KINDS)}.", *KINDS),
-    declare.text("output", "", "File for the model document; empty: none."),
+    declare.path("output", "File for the model document; empty: none."),
     Declaration(
         "replace", False,
         "Whether a new model is published whatever it lacks beside the model in use: voltage range, coverage, samples, "
@@ -76,8 +77,8 @@ DECLARATIONS = (
     declare.scalar(
         "stop", math.nan, "End of the fitted part, seconds from the first stamp; NaN or negative: last stamp.", ANY_TIME
     ),
-    declare.text(
-        "diagnosis_directory", "",
+    declare.path(
+        "diagnosis_directory",
         "Output folder of ~/diagnose; empty: NAME_diagnosis next to the output NAME.json, or, without an output, a "
         "temporary folder named in the service response.",
     ),

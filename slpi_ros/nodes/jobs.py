@@ -39,8 +39,8 @@ class Worker:
         with normal_scheduling():
             # Begun with the first process, it would unblock the signal for that one.
             resource_tracker.ensure_running()
-            # Ctrl-C reaches the whole process group; this process ends the worker itself.
-            blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+            # Ctrl-C, and the end of a terminal, reach the whole process group; this process ends the worker itself.
+            blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT, signal.SIGHUP})
             try:
                 self.process.start()
             finally:

@@ -1,9 +1,11 @@
 """Node parameters, declared in one table and validated together, and those that several nodes have."""
 
 import math
+import sys
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from difflib import get_close_matches
+from os.path import expanduser
 from typing import Any, Generic, TypeVar
 
 from rcl_interfaces.msg import FloatingPointRange, IntegerRange, ParameterDescriptor, SetParametersResult
@@ -13,6 +15,7 @@ from rclpy.parameter import Parameter
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.excitation.drives import slew_limits
 from slpi_ros.model.limits import Limits
+from slpi_ros.nodes.parameter_texts import leading_zeros, overridden
 
 Settings = TypeVar("Settings")
 Values = Mapping[str, Any]
@@ -34,6 +37,13 @@ class Declaration:
     each_axis: bool = False  # each axis may have its own value
     choices: tuple[str, ...] = ()  # of a string; (): any
     required: bool = False  # NaN is refused; else it stands for None, if it is the default
+    path: bool = False  # of a file or folder, or several; ~ is the home folder, which no shell puts in after ":="
+
+    def expanded(self, given: Any) -> Any:
+        """Return a value with the home folder for ~, if it is a path."""
+        if not self.path:
+            return given
+        return expanduser(given) if isinstance(given, str) else [expanduser(each) for each in given or ()]
 
     def read(self, values: Values, axes: Sequence[str]) -> Any:
         """Return the validated value from `values`: a tuple with one value per axis if `each_axis`."""
@@ -93,6 +103,11 @@ def each_axis(name: str, default: float, description: str, between: Range, *, re
 def text(name: str, default: str, description: str, *choices: str, read_only: bool = False) -> Declaration:
     """Declare a string parameter, limited to `choices` if any are given."""
     return Declaration(name, default, description, read_only, choices=choices)
+
+
+def path(name: str, description: str, default: str | list[str] = "", *, read_only: bool = False) -> Declaration:
+    """Declare the path of a file or folder, or of several."""
+    return Declaration(name, default, description, read_only, path=True)
 
 
 def read_only(*declarations: Declaration) -> tuple[Declaration, ...]:
@@ -167,12 +182,15 @@ class Parameters(Generic[Settings]):
 
     def __init__(self, node: Node, declarations: Sequence[Declaration], make: Callable[[Values], Settings]) -> None:
         self._node, self._make = node, make
+        self._entries = {entry.name: entry for entry in declarations}
         self._values: dict[str, Any] = {
-            entry.name: node.declare_parameter(entry.name, entry.default, entry.descriptor()).value
+            entry.name: entry.expanded(node.declare_parameter(entry.name, entry.default, entry.descriptor()).value)
             for entry in declarations
         }
         self.settings = make(self._values)
         self._tell_unknown(node)
+        for remark in (*leading_zeros(sys.argv), *overridden(sys.argv, node)):
+            node.get_logger().warning(remark)
 
     def _tell_unknown(self, node: Node) -> None:
         """Warn of parameters that are given and that the node does not have: a misspelt limit would be none."""
@@ -207,7 +225,11 @@ class Parameters(Generic[Settings]):
 
     def _ours(self, changes: Sequence[Parameter]) -> dict[str, Any]:
         """Return the changes of declared parameters, without those of rclpy such as use_sim_time."""
-        return {change.name: change.value for change in changes if change.name in self._values}
+        return {
+            change.name: self._entries[change.name].expanded(change.value)
+            for change in changes
+            if change.name in self._entries
+        }
 
 
 def numbers(values: Values, name: str, axes: Sequence[str], low: float, high: float) -> list[float]:

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import Any
 
+from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.node import Node
 from rclpy.qos import DurabilityPolicy, QoSProfile
 
@@ -17,11 +18,15 @@ from slpi_ros.nodes.parameters import Declaration, Parameters, validated
 # Queue length for bursts during slow disk writes.
 DEPTH = 10_000
 DISCOVERY_PERIOD = 0.1
+# What was received is on the disk after this time, seconds; half of a second leaves time for a slow disk.
+SYNC_PERIOD = 0.5
 # Discovery of publishers may take several seconds.
 PATIENCE = 5.0
+# Shortest time between two of the same warning, seconds.
+LOG_PERIOD = 5.0
 STAGE_STATE = "stage_state"
 DECLARATIONS = declare.read_only(
-    declare.text("output", "", "rosbag2 folder to create; required."),
+    declare.path("output", "rosbag2 folder to create; required."),
     Declaration("topics", [STAGE_STATE], "Topics to record."),
     declare.text("storage", "mcap", "File format: mcap or sqlite3.", *STORAGES),
     declare.scalar(
@@ -37,7 +42,8 @@ class Recorder(Node):
 
     Subscribes to the topics named by the parameter ``topics``, with the reliability and durability that their
     publishers offer; messages are not deserialized. An incomplete bag is kept in ``.NAME.partial`` in
-    the folder of the output. Parameters in `DECLARATIONS`.
+    the folder of the output, from which it is read if the recorder was killed: at most its last second is lost.
+    Parameters in `DECLARATIONS`.
     """
 
     def __init__(self) -> None:
@@ -58,6 +64,8 @@ class Recorder(Node):
             if topic.rpartition("/")[2] == STAGE_STATE:
                 self._subscribe(name, JOINT_STATE, ())
         self._discovery = steady_timer(self, DISCOVERY_PERIOD, self._discover)
+        self._synced = 0  # messages on the disk
+        steady_timer(self, SYNC_PERIOD, self._sync)
         if self._duration:
             self._end = steady_timer(self, self._duration + PATIENCE, request_stop)
         self.get_logger().info(f"recording {', '.join(self._awaited)} into {output}")
@@ -65,8 +73,8 @@ class Recorder(Node):
     def destroy_node(self) -> None:
         """Complete the bag, then destroy the node; RecordError if it is empty or cannot be completed."""
         try:
-            if self.context.ok():
-                self._drain()
+            for name in self._listening if self.context.ok() else ():
+                self._drain(name)
             if self._bag is not None:
                 self._finish(self._bag)
         finally:
@@ -103,12 +111,22 @@ class Recorder(Node):
         if former is not None and former.qos_profile == qos:
             return
         if former is not None:
+            self._drain(name)
             self.destroy_subscription(former)
         elif self._bag is not None:
             self._bag.add_topic(name, msgtype)
-        self._listening[name] = self.create_subscription(
-            message_class(name, msgtype), name, partial(self._record, name), qos, raw=True
-        )
+        # rclpy's own one says that no message will come.
+        events = SubscriptionEventCallbacks(incompatible_qos=partial(self._adapt, name), use_default_callbacks=False)
+        subscribe = partial(self.create_subscription, message_class(name, msgtype), name)
+        try:
+            self._listening[name] = subscribe(partial(self._record, name), qos, raw=True, event_callbacks=events)
+        except UnsupportedEventTypeError:
+            self._listening[name] = subscribe(partial(self._record, name), qos, raw=True)
+
+    def _adapt(self, name: str, _: object) -> None:
+        """Subscribe anew with a QoS that a further publisher offers, too."""
+        self._awaited.setdefault(name, name)
+        self._discovery.reset()
 
     def _record(self, name: str, message: bytes) -> None:
         if self._bag is None:
@@ -116,22 +134,42 @@ class Recorder(Node):
         if self._duration and not self._bag.message_count:
             self.destroy_timer(self._end)
             self._end = steady_timer(self, self._duration, request_stop)
+        now_ns = self.get_clock().now().nanoseconds
+        if not now_ns:
+            self.get_logger().warning(
+                "use_sim_time is set and nobody publishes /clock: messages are recorded at time 0; start what "
+                "publishes it, or leave use_sim_time out",
+                throttle_duration_sec=LOG_PERIOD,
+            )
         try:
-            self._bag.write(self.get_clock().now().nanoseconds, message, name)
+            self._bag.write(now_ns, message, name)
         except RecordError as error:
-            request_stop(RecordError(f"{error}; its unfinished files are in {self._bag.partial}"))
-            self._bag = None
+            self._give_up(self._bag, error)
 
-    def _drain(self) -> None:
-        """Record the messages still queued in the middleware after the executor has stopped."""
-        for name, subscription in self._listening.items():
-            with subscription.handle:
-                # Limited, so that continuous publishing cannot delay the end.
-                for _ in range(DEPTH):
-                    taken = subscription.handle.take_message(subscription.msg_type, True)
-                    if taken is None:
-                        break
-                    self._record(name, taken[0])
+    def _sync(self) -> None:
+        """Write to the disk what has come since the last call."""
+        if self._bag is None or self._bag.message_count == self._synced:
+            return
+        self._synced = self._bag.message_count
+        try:
+            self._bag.sync()
+        except RecordError as error:
+            self._give_up(self._bag, error)
+
+    def _give_up(self, bag: BagWriter, error: RecordError) -> None:
+        request_stop(RecordError(f"{error}; its unfinished files are in {bag.partial}"))
+        self._bag = None
+
+    def _drain(self, name: str) -> None:
+        """Record the messages of a topic that are still queued in the middleware."""
+        subscription = self._listening[name]
+        with subscription.handle:
+            # Limited, so that continuous publishing cannot delay the end.
+            for _ in range(DEPTH):
+                taken = subscription.handle.take_message(subscription.msg_type, True)
+                if taken is None:
+                    break
+                self._record(name, taken[0])
 
     def _finish(self, bag: BagWriter) -> None:
         """Close the bag and move it to its final path; RecordError if it is empty."""

@@ -9,7 +9,7 @@ if TYPE_CHECKING:
 
 # Ctrl-C often arrives twice (terminal and launcher), so only the third signal interrupts an orderly shutdown.
 PATIENT_SIGNALS = 2
-SIGNALS = (signal.SIGINT, signal.SIGTERM)
+SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 class Stop:
@@ -28,12 +28,13 @@ class Stop:
 
 
 def listening() -> Stop:
-    """Return a stop request of this process, which SIGINT and SIGTERM are from now on."""
+    """Return a stop request of this process, which `SIGNALS` are from now on; an ignored SIGHUP stays so (nohup)."""
     stop = Stop()
     # Python allows signal handlers in the main thread only. They stay until the process has ended.
     if threading.current_thread() is threading.main_thread():
         for number in SIGNALS:
-            signal.signal(number, stop.on_signal)
+            if number != signal.SIGHUP or signal.getsignal(number) != signal.SIG_IGN:
+                signal.signal(number, stop.on_signal)
     return stop
 
 

@@ -34,12 +34,17 @@ class Check:
     level: str
     text: str
 
-    def line(self) -> str:
-        """Return the statement as a line of text; what to do about a failed check is on the next line."""
+    @property
+    def remedy(self) -> str:
+        """What to do."""
+        return self.text.rpartition("; ")[2]
+
+    def lines(self) -> list[str]:
+        """Return the statement as lines of text; what to do about a failed check is on the second line."""
         found, separator, remedy = self.text.rpartition("; ")
         if self.level == FAILED and separator:
-            return f"{self.level:6} {found}\n{'':6} {remedy}"
-        return f"{self.level:6} {self.text}"
+            return [f"{self.level:6} {found}", f"{'':6} {remedy}"]
+        return [f"{self.level:6} {self.text}"]
 
 
 @dataclass(frozen=True)
@@ -253,12 +258,18 @@ def _overlap(what: str, known: Range, limits: Range, remedy: str) -> Check:
     return Check(NOTE, f"{text}: a part of the stroke is not used") if narrower else Check(OK, text)
 
 
+def worst_first(checks: Iterable[Check]) -> list[Check]:
+    """Return the failed checks, the notes, and what is well."""
+    return sorted(checks, key=lambda check: (FAILED, NOTE, OK).index(check.level))
+
+
 def described(checks: Iterable[Check]) -> tuple[str, list[str], list[str]]:
     """Return the verdict, the lines of what is not well, and all lines; failed checks come first."""
-    ordered = sorted(checks, key=lambda check: (FAILED, NOTE, OK).index(check.level))
+    ordered = worst_first(checks)
     count = sum(check.level == FAILED for check in ordered)
     verdict = f"FAILED: {count} check{'s' * (count > 1)}" if count else f"GOOD: {len(ordered)} checks passed"
-    return verdict, [check.line() for check in ordered if check.level != OK], [check.line() for check in ordered]
+    unwell = [line for check in ordered if check.level != OK for line in check.lines()]
+    return verdict, unwell, [line for check in ordered for line in check.lines()]
 
 
 def doctor_document(checks: Sequence[Check]) -> dict[str, Any]:

@@ -278,6 +278,7 @@ def test_what_is_left_of_a_compensated_path_is_blamed_on_its_cause(blame, cause,
     assert set(tracking.shares) == set(CAUSES) and sum(tracking.shares.values()) == pytest.approx(1.0)
     if blame == "delay":
         assert tracking.delay == pytest.approx(8 / RATE, rel=0.1)
+        assert tracking.behind == 0.0 and "voltages" in tracking.advice("delay")
 
 
 @pytest.mark.parametrize("shift", [0.0, 4e-7])
@@ -289,7 +290,9 @@ def test_a_late_stage_is_told_from_its_hysteresis_and_zero(shift, model):
     y = np.concatenate([np.full(late, y[0]), y[:-late]])
     tracking = judged(record_of(t, v, y), model, desired=[{"x": desired + shift}]).tracking
     parts = tracking.rms
-    assert tracking.delay == pytest.approx(late / RATE, rel=0.1)
+    assert tracking.delay == tracking.behind == pytest.approx(late / RATE, rel=0.1)
+    # A trajectory sends nothing ahead by a delay that the model does not hold.
+    assert "slpi diagnose" in tracking.advice("delay")
     assert parts["delay"] == pytest.approx(rms(y - np.interp(t, t - late / RATE, y)), rel=0.15)
     # A path that counts from another zero.
     assert parts["zero"] == pytest.approx(shift, abs=0.2 * parts["delay"])

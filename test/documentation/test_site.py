@@ -146,3 +146,18 @@ def test_the_example_of_ros2_control_agrees_with_the_compensator():
     topics = {each["name"] for each in json.loads((ROOT / "msg_schemas" / "topics.json").read_text())["topics"]}
     assert set(re.findall(r'\("(\w+)", "/', launch)) <= topics
     compile(launch, "ros2_control.launch.py", "exec")
+
+
+@pytest.mark.parametrize("page", [README, *PAGES], ids=lambda page: str(page.relative_to(ROOT)))
+def test_beside_each_ros2_line_that_calls_or_sets_is_one_without_it(page):
+    text = page.read_text()
+    for node, service in re.findall(r"ros2 service call (/[\w/]+)/(\w+)", text):
+        assert f"slpi call {node} {service}" in text
+    for node, name in re.findall(r"ros2 param set (/\w+) (\w+)", text):
+        assert f"slpi param {node} {name}" in text
+
+
+def test_nothing_moves_in_a_tutorial_before_its_limits_are_given():
+    for page in (DOCS / "tutorials").glob("*.md"):
+        for words in commands_of(page, "bash", "console"):
+            assert "/voltage_command" not in words, "a raw voltage keeps no limit"

@@ -326,13 +326,13 @@ def test_metadata_without_its_file(tmp_path):
     assert holds(refusal(RecordError, read_bag, tmp_path / "bag"), tmp_path / "bag", "bag.mcap")
 
 
-def test_recorder_that_was_killed(tmp_path):
+def test_recorder_that_lives(tmp_path):
     bag = BagWriter(tmp_path / "bag")
     for row in range(20_000):
         bag.write(row, state(row))
     assert holds(refusal(RecordError, read_bag, tmp_path / "bag"), bag.partial)
     assert holds(refusal(RecordError, read_bag, bag.partial / "bag"), "mcap recover")
-    assert holds(refusal(RecordError, BagWriter, tmp_path / "bag"), bag.partial, "mcap recover")
+    assert holds(refusal(RecordError, BagWriter, tmp_path / "bag"), bag.partial)
     bag.discard()
     assert os.listdir(tmp_path) == []
 

@@ -100,6 +100,23 @@ def test_whoever_ends_it_the_stage_comes_to_rest(tmp_path, how):
 
 
 @pytest.mark.ros
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGHUP])
+def test_a_terminal_that_ends_it_hears_where_the_stage_is_left_and_nothing_of_its_worker(tmp_path, number):
+    """As from a shell, whose first worker starts also what multiprocessing needs for all."""
+    output = {"output": str(tmp_path / "out")}
+    with on_graph() as graph, started("calibrator", PARAMETERS | output, fresh=True) as node:
+        stage = FaultyStage(graph.node)
+        graph.tested = node
+        children = Path(f"/proc/{node.process.pid}/task/{node.process.pid}/children")
+        # The worker, which still imports, beside the tracker of resources.
+        graph.spin_until(lambda: len(children.read_text().split()) > 1, "the worker")
+        os.killpg(node.process.pid, number)
+        assert ended(graph, node) == 1
+        assert "Traceback" not in node.stderr and f"at {REST:g} V" in node.stderr.strip().splitlines()[-1]
+    require_safe(stage)
+
+
+@pytest.mark.ros
 @pytest.mark.long
 def test_a_killed_calibration_is_resumed_with_the_bags_that_are_complete(tmp_path):
     parameters = {**PARAMETERS, "output": str(tmp_path / "out")}

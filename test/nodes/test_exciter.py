@@ -205,7 +205,7 @@ def test_a_stall_delays_the_drive_and_never_makes_it_leap():
     np.testing.assert_array_equal(v, drawn(duration=2.0, slew_limit=0.0)[-len(v) :])
 
 
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_a_signal_brings_the_stage_back(number):
     with (
         on_graph() as graph,

@@ -87,7 +87,7 @@ def feed(recording: Recording, publisher, messages: int) -> None:
 
 
 @pytest.mark.parametrize(
-    ("storage", "number"), [("mcap", signal.SIGINT), ("sqlite3", signal.SIGTERM), ("mcap", signal.SIGTERM)]
+    ("storage", "number"), [("mcap", signal.SIGINT), ("sqlite3", signal.SIGTERM), ("mcap", signal.SIGHUP)]
 )
 def test_records_until_a_signal(tmp_path, node, record, storage, number):
     publisher = node.create_publisher(JointState, "stage_state", RELIABLE)
@@ -106,6 +106,24 @@ def test_records_until_a_signal(tmp_path, node, record, storage, number):
     assert set(read.voltage["y"]) == {-1.0}
 
 
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_killed_at_any_moment_it_loses_its_last_second_at_most(tmp_path, node, record, storage):
+    publisher = node.create_publisher(JointState, "stage_state", RELIABLE)
+    recording = record(output=tmp_path / "bag", storage=storage)
+    feed(recording, publisher, 1000)
+    # More than the file has without messages, and less than these have.
+    written = tmp_path / ".bag.partial" / "bag" / f"bag.{'mcap' if storage == 'mcap' else 'db3'}"
+    recording.wait_until(lambda: written.stat().st_size > 100_000)
+    for row in range(1000, 1100):
+        publisher.publish(state(row))
+    recording.node.process.kill()
+    assert recording.node.wait() == -signal.SIGKILL
+    read = read_bag(tmp_path / "bag")
+    assert 500 < len(read) <= 1100
+    assert read.displacement["x"].tolist() == [row * 1e-9 for row in range(len(read))]
+    assert read.notes
+
+
 def test_several_topics_each_as_it_is_published(tmp_path, node, record):
     latched = node.create_publisher(String, "/lab/stage_model", LATCHED)
     latched.publish(String(data="latched before"))
@@ -117,17 +135,52 @@ def test_several_topics_each_as_it_is_published(tmp_path, node, record):
     recording.wait_until(lambda: late.get_subscription_count() and latched.get_subscription_count())
     late.publish(Float64(data=21.5))
     assert all(reliable.wait_for_all_acked(rclpy.duration.Duration(seconds=PATIENCE_S)) for reliable in (late, latched))
-    # a recorder that insisted on reliable messages would get none of these
+    # a recorder that insisted on reliable messages would get none of these, and rclpy says so while it does
     for row in range(50):
         states.publish(state(row))
         time.sleep(0.02)
-    assert recording.end(signal.SIGINT)[0] == 0
+    code, said = recording.end(signal.SIGINT)
+    assert code == 0 and "No messages" not in said
     assert 0 < len(read_bag(tmp_path / "bag", "/lab/state")) <= 50
     with (tmp_path / "bag" / "bag.mcap").open("rb") as stream:
         reader = make_reader(stream, decoder_factories=[DecoderFactory()])
         rows = [(channel.topic, message) for _, channel, _, message in reader.iter_decoded_messages()]
     assert [message.data for topic, message in rows if topic == "/lab/stage_model"] == ["latched before"]
     assert [message.data for topic, message in rows if topic == "/lab/temperature"] == [21.5]
+
+
+def test_a_further_publisher_of_another_quality_is_recorded_too(tmp_path, node, record):
+    first = node.create_publisher(JointState, "stage_state", RELIABLE)
+    recording = record(output=tmp_path / "bag")
+    feed(recording, first, 100)
+    second = node.create_publisher(JointState, "stage_state", qos_profile_sensor_data)
+    recording.wait_until(lambda: second.get_subscription_count() > 0)
+    for row in range(100, 150):
+        second.publish(state(row))
+        time.sleep(0.02)
+    assert recording.end(signal.SIGINT)[0] == 0
+    read = read_bag(tmp_path / "bag")
+    assert read.displacement["x"][:100].tolist() == [row * 1e-9 for row in range(100)]
+    assert len(read) > 100
+    assert "No messages" not in recording.node.stderr
+
+
+def test_a_simulated_clock_that_nobody_publishes_is_told(tmp_path, node, record):
+    publisher = node.create_publisher(JointState, "stage_state", RELIABLE)
+    recording = record(output=tmp_path / "bag", use_sim_time="true")
+    feed(recording, publisher, 10)
+    code, said = recording.end(signal.SIGINT)
+    assert code == 0 and holds(said, "use_sim_time", "/clock")
+    assert len(read_bag(tmp_path / "bag")) == 10
+
+
+def test_the_home_folder_is_put_in_for_its_sign(tmp_path, node, record, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    publisher = node.create_publisher(JointState, "stage_state", RELIABLE)
+    recording = record(output="~/bag")
+    feed(recording, publisher, 10)
+    assert recording.end(signal.SIGINT)[0] == 0
+    assert len(read_bag(tmp_path / "bag")) == 10
 
 
 def test_duration(tmp_path, node, record):

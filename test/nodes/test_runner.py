@@ -88,7 +88,7 @@ def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
 
 
 @both_executors
-@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP])
 def test_signal_ends_in_order(executor, number):
     process = start("spin", executor)
     assert process.stdout.readline() == "up\n"
@@ -96,6 +96,20 @@ def test_signal_ends_in_order(executor, number):
     code, output, errors = finish(process)
     assert (code, errors) == (0, "")
     assert output.endswith("destroyed\n")
+
+
+def test_hangup_that_is_ignored_at_the_start_stays_so():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        process = start("spin")
+    finally:
+        signal.signal(signal.SIGHUP, before)
+    assert process.stdout.readline() == "up\n"
+    process.send_signal(signal.SIGHUP)
+    for _ in range(20):
+        assert process.stdout.readline() == "up\n"
+    process.send_signal(signal.SIGTERM)
+    assert finish(process)[::2] == (0, "")
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

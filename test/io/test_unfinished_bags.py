@@ -1,0 +1,127 @@
+"""What a killed writer of a bag leaves: read as it lies, up to what was on the disk."""
+
+import os
+import shutil
+import signal
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from refusals import holds, refusal
+
+from slpi_ros.errors import RecordError
+from slpi_ros.io.bag_files import BagWatch
+from slpi_ros.io.bag_reader import read_bag
+from slpi_ros.io.bag_writer import BagWriter
+from slpi_ros.io.unfinished_bags import NOTE, is_being_written, partial_path
+
+# Messages on the disk, and further ones that the process takes with it; the second time SQLite has written some of
+# these to its file, and needs its journal to undo them.
+SYNCED, LOST = 700, 9000
+WRITER = """
+import os, signal, sys
+from slpi_ros.io.bag_writer import BagWriter
+from slpi_ros.io.messages import encode_joint_states
+import numpy as np
+
+path, storage, synced, lost, spilled = sys.argv[1], sys.argv[2], *map(int, sys.argv[3:6])
+bag = BagWriter(path, storage=storage)
+count = synced + lost
+t = np.arange(1, count + 1, dtype=np.int64) * 1_000_000
+messages = encode_joint_states(t, np.arange(count)[:, None] * 1e-9, np.ones((count, 1)), ("x",), "stage-7")
+if spilled:
+    bag._writer.storage.conn.execute("PRAGMA cache_size = 1")
+for row, message in enumerate(messages):
+    if row == synced:
+        bag.sync()
+    bag.write(int(t[row]), message)
+print("written", flush=True)
+if sys.stdin.readline():
+    os.kill(os.getpid(), signal.SIGKILL)
+"""
+
+
+def writing(path, storage, synced=SYNCED, lost=LOST, spilled=False) -> subprocess.Popen[str]:
+    """Return a process that has written to a bag, and kills itself when it is told to."""
+    given = [str(path), storage, *map(str, (synced, lost, int(spilled)))]
+    command = [sys.executable, "-c", WRITER, *given]
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert process.stdout.readline() == "written\n"
+    return process
+
+
+def killed(process: subprocess.Popen[str]) -> None:
+    process.communicate("die\n")
+    assert process.returncode == -signal.SIGKILL
+
+
+@pytest.mark.parametrize(("storage", "spilled"), [("mcap", False), ("sqlite3", False), ("sqlite3", True)])
+def test_what_was_on_the_disk_is_read_as_it_lies(tmp_path, storage, spilled):
+    path = tmp_path / "bag"
+    process = writing(path, storage, spilled=spilled)
+    assert is_being_written(partial_path(path))
+    assert holds(refusal(RecordError, read_bag, path), partial_path(path), "wait")
+    killed(process)
+    assert not is_being_written(partial_path(path))
+    left = partial_path(path) / "bag"
+    (file,) = (each for each in left.iterdir() if each.suffix in (".mcap", ".db3"))
+    before = {each.name: each.read_bytes() for each in left.iterdir()}
+    for place in (path, partial_path(path), left, file):
+        record = read_bag(place)
+        assert SYNCED <= len(record) < SYNCED + LOST + (storage == "mcap")
+        np.testing.assert_array_equal(record.displacement["x"], np.arange(len(record)) * 1e-9)
+        assert record.hardware_id == "stage-7" and NOTE in record.notes
+    if storage == "sqlite3":
+        assert len(record) == SYNCED
+        assert (left / "bag.db3-journal").exists() == spilled or not spilled
+    assert before == {each.name: each.read_bytes() for each in left.iterdir()}
+    assert holds(refusal(RecordError, BagWriter, path), partial_path(path), "slpi")
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_nothing_was_on_the_disk(tmp_path, storage):
+    killed(writing(tmp_path / "bag", storage, synced=10, lost=-5))
+    assert holds(refusal(RecordError, read_bag, tmp_path / "bag"), "bag")
+
+
+def test_mcap_that_ends_anywhere_in_a_record(tmp_path):
+    killed(writing(tmp_path / "bag", "mcap", lost=1))
+    file = partial_path(tmp_path / "bag") / "bag" / "bag.mcap"
+    whole = file.read_bytes()
+    sizes = set()
+    for kept in (*np.random.default_rng(1).integers(0, len(whole), 30), len(whole)):
+        file.write_bytes(whole[:kept] + bytes(kept % 3))
+        try:
+            sizes.add(len(read_bag(tmp_path / "bag")))
+        except RecordError as error:
+            assert "\n" not in str(error)
+            sizes.add(0)
+    assert sizes == {0, SYNCED}
+
+
+def test_a_journal_that_names_another_is_refused(tmp_path):
+    killed(writing(tmp_path / "bag", "sqlite3", spilled=True))
+    journal = partial_path(tmp_path / "bag") / "bag" / "bag.db3-journal"
+    journal.write_bytes(journal.read_bytes() + b"\xd9\xd5\x05\xf9\x20\xa1\x63\xd7")
+    assert holds(refusal(RecordError, read_bag, tmp_path / "bag"), "journal")
+
+
+def test_a_watched_folder_gives_it_once_its_writer_is_dead(tmp_path):
+    watch = BagWatch(tmp_path)
+    process = writing(tmp_path / "bag", "mcap")
+    assert watch.poll() == []
+    killed(process)
+    (found,) = watch.poll()
+    assert len(read_bag(found)) >= SYNCED
+    assert watch.poll() == []
+
+
+def test_a_complete_bag_of_the_name_comes_first(tmp_path):
+    killed(writing(tmp_path / "bag", "mcap"))
+    shutil.move(partial_path(tmp_path / "bag"), tmp_path / "aside")
+    with BagWriter(tmp_path / "bag") as bag:
+        bag.write(1, bytes(100))
+    shutil.move(tmp_path / "aside", partial_path(tmp_path / "bag"))
+    assert os.listdir(tmp_path / "bag")
+    assert holds(refusal(RecordError, read_bag, tmp_path / "bag"), tmp_path / "bag")

@@ -20,8 +20,8 @@ ROUNDING = 1e-6
 CELLS, LAG_NS = 64, 3 * SECOND_NS // 10
 # Readings that are taken: at most one in this time; those of which the noise is told.
 PERIOD_NS, KEPT = SECOND_NS // 200, 64
-# Median of the absolute value of a normal value, in standard deviations.
-NORMAL = 0.6745
+# Lower quartile of the absolute value of a normal value, in standard deviations: the stage may move most of the time.
+QUARTILE = 0.3186
 
 
 def implausible_stroke(stroke: float) -> str:
@@ -41,7 +41,7 @@ def implausible_noise(y: FloatArray) -> str:
     fresh = np.concatenate((y[:1], y[1:][steps != 0.0]))
     if fresh.size < FEWEST:
         return ""
-    noise = float(np.median(np.abs(np.diff(fresh, 2)))) / (NORMAL * BEND)
+    noise = float(np.quantile(np.abs(np.diff(fresh, 2)), 0.25)) / (QUARTILE * BEND)
     # Less than their digit readings cannot show.
     noise = max(noise, float(np.abs(steps[steps != 0.0]).min()))
     return (

@@ -1,6 +1,7 @@
 """``slpi doctor --device``: what is there, what will bite, and the YAML to start with; nothing is written."""
 
 import json
+import math
 
 import pytest
 import yaml
@@ -31,7 +32,9 @@ def test_a_device_is_read_and_a_yaml_is_printed(name):
     text = done.stdout[done.stdout.index("driver:\n") :]
     values = yaml.safe_load(text[: text.index("\n\n")])["driver"]["ros__parameters"]
     assert values["device"] == kind.device and values["channels"] == [kind.axes[0]]
-    assert values["rate"] in RATES and values["sensor_scale"] == SENSOR_SCALES.get(kind.device, 1e-6)
+    # A PI controller tells its unit.
+    told = math.nan if kind.device == "gcs" else SENSOR_SCALES.get(kind.device, 1e-6)
+    assert values["rate"] in RATES and values["sensor_scale"] == pytest.approx(told, nan_ok=True)
     (low,), (high,) = values["voltage_min"], values["voltage_max"]
     at = 20.0 / kind.gain
     assert low <= at <= high and high - low <= 10.0
@@ -58,6 +61,16 @@ def test_what_is_dangerous_fails():
         done = doctor("--device", f"labjack:{simulator.address}", "--json")
         assert simulator.log == []
     assert done.returncode == 1 and "WATCHDOG_RESET_ENABLE" in json.loads(done.stdout)["checks"][0]["text"]
+
+
+@pytest.mark.parametrize(
+    ("simulated", "code", "told"),
+    [({"unit": "MM"}, 0, "MM"), ({"unit": "MM", "without": ["PUN?"]}, 1, "25 nm"), ({"unit": "NM"}, 0, "NM")],
+)
+def test_the_unit_of_a_controller(simulated, code, told):
+    with GcsSimulator(**simulated) as simulator:
+        done = doctor("--device", f"gcs:{simulator.address}")
+    assert done.returncode == code and told in done.stdout
 
 
 @pytest.mark.parametrize("device", ["abacus:1", "gcs:host:port", "serial:/dev/x", "gcs"])

@@ -12,6 +12,7 @@ from slpi_ros.calibration.choice import next_drive
 from slpi_ros.calibration.drives import SWEEP_SECONDS, checking, compensated, driven_so_far, exciting
 from slpi_ros.calibration.kept import FOLLOWS, naming, require_kept
 from slpi_ros.calibration.settings import CALIBRATION, CalibrationSettings
+from slpi_ros.compensator.plausible import implausible_noise, implausible_stroke
 from slpi_ros.diagnosis.result import Diagnosis
 from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.errors import RecordError, length
@@ -225,7 +226,7 @@ class _Calibration:
         recording = self._recorded(CHECK_DRIVE, drive, {})
         record = recording.record
         with naming(record) if recording.kept else nullcontext():
-            findings = [_follows(axis, drive, record) for axis in self._settings.axes]
+            findings = [_follows(axis, drive, record, self._settings) for axis in self._settings.axes]
         self._first = record
         self._steps.append(Step(record.source, float(drive.t[-1]), drive.why, "; ".join(findings)))
 
@@ -342,8 +343,8 @@ def _left_at(model: StageModel, last: Record) -> StageModel:
     return replace(model, axes=axes)
 
 
-def _follows(axis: str, drive: Drive, record: Record) -> str:
-    """Return what the check has shown of an axis; RecordError if it does not follow."""
+def _follows(axis: str, drive: Drive, record: Record, settings: CalibrationSettings) -> str:
+    """Return what the check has shown of an axis; RecordError if it does not follow, or as no stage does."""
     record.require_axis(axis)
     v, y = record.voltage[axis], record.displacement[axis]
     known = np.isfinite(v) & np.isfinite(y)
@@ -367,6 +368,14 @@ def _follows(axis: str, drive: Drive, record: Record) -> str:
         raise RecordError(
             f"axis '{axis}': the displacement falls by {-slope * applied:.3g} m when the voltage rises by "
             f"{applied:.3g} V; change the sign of the displacement in the driver"
+        )
+    limits = settings.limits[settings.axes.index(axis)]
+    # Over the whole range, before it goes there.
+    units = implausible_stroke(slope * limits.span) or implausible_noise(y)
+    if units and not settings.accept_units:
+        raise RecordError(
+            f"axis '{axis}': {units}, which no piezo stage has: it follows with {slope:.3g} m/V; check the unit and "
+            "sensor_scale of the driver, or set accept_units:=true"
         )
     return f"axis {axis} follows with {slope * 1e6:.3g} µm/V"
 

@@ -23,6 +23,7 @@ class CalibrationSettings:
     budget: float  # s, the largest sum of the durations of all drives
     target: float = 0.0  # m, mean error on a path not used for the model; 0: `times_repeatability` the repeatability
     times_repeatability: float = 3.0
+    accept_units: bool = False  # whether a stroke or a noise that no stage has is taken for one
     seed: int = 0  # of the random parts of the drives
     accept_stage: str = ""  # name of a stage whose kept bags are taken for those of this one
     # m, (N,), by axis at `rate`: the path that is to be covered, and on which models are verified; none: random ones

@@ -14,6 +14,7 @@ from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.progress import report_progress
 
 if TYPE_CHECKING:
+    from slpi_ros.arrays import FloatArray
     from slpi_ros.drivers.base import Device
     from slpi_ros.reports.doctor import Check
 
@@ -133,33 +134,37 @@ def _read_device(device: str, channels: Sequence[str]) -> "tuple[list[Check], li
     """Open a device and read it; return the checks, and the lines with its table and the YAML to start with."""
     from slpi_ros.drivers.base import Channel
     from slpi_ros.drivers.registry import FIRST_CHANNEL, make_device
-    from slpi_ros.reports.device import check_device, device_parameters, device_table
+    from slpi_ros.reports.device import SENSOR_SCALES, check_device, device_parameters, device_table
     from slpi_ros.reports.doctor import FAILED, Check
 
     kind, _, address = device.partition(":")
     dialect = address.partition(":")[0]
     names = list(channels) or [FIRST_CHANNEL.get(dialect) or FIRST_CHANNEL.get(kind, "1")]
-    # Volts and positions in units of the device.
-    opened = make_device(kind, address, [Channel(name, scale=1.0) for name in names])
+    # Volts of the device, and metres as it tells its unit.
+    opened = make_device(kind, address, [Channel(name, scale=SENSOR_SCALES.get(kind, math.nan)) for name in names])
     try:
         found = opened.open()
-        cycle = _cycle_of(opened)
+        cycle, positions = _cycle_of(opened)
+        scales = [channel.scale for channel in opened.channels]
     except SlpiError as error:
         return [Check(FAILED, str(error))], []
     finally:
         opened.close()
     yaml = device_parameters(kind, address, found, names, cycle)
-    return check_device(opened.name, found, names), [*device_table(found, names), "", "driver.yaml:", *yaml, ""]
+    checks = check_device(opened.name, found, names, positions)
+    return checks, [*device_table(found, names, scales), "", "driver.yaml:", *yaml, ""]
 
 
-def _cycle_of(device: "Device") -> float:
-    """Return the time of one reading (s) of an open device, the median of several."""
-    times = []
+def _cycle_of(device: "Device") -> "tuple[float, FloatArray]":
+    """Return the time of one reading (s) of an open device, the median of several, and their positions (m, (N, n))."""
+    import numpy as np
+
+    times, positions = [], []
     for _ in range(TIMED):
         begun = time.perf_counter()
-        device.read()
+        positions.append(device.read().positions)
         times.append(time.perf_counter() - begun)
-    return statistics.median(times)
+    return statistics.median(times), np.array(positions)
 
 
 COMMAND = Command(

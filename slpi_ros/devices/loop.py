@@ -8,9 +8,11 @@ from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 
+from slpi_ros.compensator.monitor import Finding
 from slpi_ros.compensator.statistics import Timing
 from slpi_ros.devices.block import BUSY, Blocks
 from slpi_ros.devices.link import State, Status, opened
+from slpi_ros.devices.monitor import DeviceMonitor
 from slpi_ros.devices.pace import Pace
 from slpi_ros.devices.writer import LoopSettings, Writer
 from slpi_ros.drivers.base import Device, DeviceError, Found, Reading
@@ -41,6 +43,8 @@ class DeviceLoop:
     device : the device; used by the thread of `run` alone
     settings : axes, limits and rate
     on_reading : called by the thread with each reading
+    on_found : called by the thread with what is found at each opening, before anything is read or written; an error
+        other than a DeviceError ends `run`
     now_ns : the steady clock (ns)
 
     Cycles fall in step with commands that come steadily, so that these are not written up to a cycle late (`Pace`).
@@ -48,7 +52,8 @@ class DeviceLoop:
     The first opening raises its error out of `run`. Nothing is written before the first command, and the first voltage
     starts from the one that the device had. After an error the device is opened anew until it succeeds; then it is
     only read until `arm`, or armed at once with ``rearm``. Voltages pass a `Writer`, blocks are those of
-    `Blocks`. A finding of the writer's monitor holds the device.
+    `Blocks`. A finding of the writer's monitor holds the device. Those of `monitor` are told; at the silence of the
+    commands the device holds, or goes to ``silence_rest``, after which it is held unless ``rearm`` is set.
     """
 
     def __init__(
@@ -57,15 +62,19 @@ class DeviceLoop:
         settings: LoopSettings,
         on_reading: Callable[[Reading], None],
         now_ns: Callable[[], int] = time.monotonic_ns,
+        on_found: Callable[[Found], None] = lambda found: None,
     ) -> None:
         self.counts, self.timing = LoopCounts(), Timing()
         self.found: Found | None = None
         self.latest: Reading | None = None
         self.answers: deque[tuple[str, bool, str]] = deque()  # request, whether it succeeded, text
         self._device, self._settings, self._on_reading, self._now_ns = device, settings, on_reading, now_ns
+        self._on_found = on_found
         self.status, self._retry_ns = Status(State.OPENING), 0
         self._writer = Writer(settings)
         self.blocks = Blocks(device, settings, self._writer)
+        self.monitor = DeviceMonitor(settings)
+        self._resting = False  # on the way to rest, though held
         # Free once a command has come that no cycle has taken; an event would take several times longer.
         self._commanded = threading.Lock()
         self._commanded.acquire()
@@ -86,6 +95,7 @@ class DeviceLoop:
             reason = BUSY
         else:
             self._writer.goal = tuple(voltages)
+            self.monitor.commands.carried_out(self._now_ns())
             # It is free already if no cycle has taken the one before.
             with suppress(RuntimeError):
                 self._commanded.release()
@@ -100,6 +110,11 @@ class DeviceLoop:
     def end(self) -> None:
         """Ask the thread to end: after the ramp to rest, if there is one."""
         self._ending = True
+
+    @property
+    def written(self) -> tuple[float, ...]:
+        """Voltages that were written last, or that the device had at the start, volts."""
+        return self._writer.written
 
     @property
     def limited(self) -> tuple[str, ...]:
@@ -144,14 +159,38 @@ class DeviceLoop:
     def _cycle(self, now_ns: int) -> None:
         """Write what is due, read, and look at what was read. Raises DeviceError."""
         armed = self.status.armed and not self._ending
+        if self.blocks.moving:
+            self.monitor.commands.carried_out(now_ns)
         self.blocks.serve("" if armed else self.status.reason or "the driver ends", now_ns)
         reading = self._device.exchange(self._next(now_ns))
         self.counts.cycles += 1
         self.latest = reading
         self._on_reading(reading)
         self.blocks.note(reading)
-        if self.status.armed and not self.blocks.by_device and (found := self._writer.compare(reading, now_ns)):
-            self._set(State.HELD, f"{self._device.name}: {found}")
+        if self._moving and not self.blocks.by_device and (found := self._writer.compare(reading, now_ns)):
+            self._hold(f"{self._device.name}: {found}")
+        for new in self.monitor.look(reading, now_ns):
+            if new.rule == "commands":
+                self._fall_silent(new)
+        self._resting &= self._writer.written != self._settings.silence_rest
+
+    @property
+    def _moving(self) -> bool:
+        """Whether voltages may be written."""
+        return self.status.armed or self._resting
+
+    def _fall_silent(self, found: Finding) -> None:
+        """Hold, or go to rest, as commands have ceased."""
+        rest = self._settings.silence_rest
+        self._writer.goal = rest
+        if rest is not None and not self._settings.rearm:
+            self._hold(f"{found}: goes to rest at {volts(*rest)} V; call ~/arm to go on", resting=True)
+
+    def _hold(self, reason: str, *, resting: bool = False) -> None:
+        """Follow no commands until the device is armed; go to the goal of a rest first."""
+        self._resting = resting
+        self.monitor.commands.forget()
+        self._set(State.HELD, reason)
 
     def _next(self, now_ns: int) -> tuple[float, ...] | None:
         """Return the voltages (V) to write; None if they are those that were written last, or nothing is commanded."""
@@ -160,9 +199,9 @@ class DeviceLoop:
             goal = self._settings.rest
         elif self.blocks.moving:
             goal = self.blocks.goal(now_ns)
-        if goal is None or not self.status.armed:
+        if goal is None or not self._moving:
             return None
-        return self._writer.step(goal, now_ns, gently=self._ending)
+        return self._writer.step(goal, now_ns, gently=self._ending or goal is self._settings.silence_rest)
 
     def _wait(self, pace: Pace) -> None:
         """Wait until a cycle is due, which a command may bring forward."""
@@ -178,26 +217,31 @@ class DeviceLoop:
                 self.blocks.stop("the driver ends")
             except DeviceError as error:
                 self._lose(error)
-        return rest is not None and self.status.armed and self._writer.written != rest
+        return rest is not None and self._moving and self._writer.written != rest
 
     # The link
 
     def _open(self, *, arm: bool) -> None:
         """Open the device, and go on from the voltages that it has; older goals are dropped. Raises DeviceError."""
         self.found, held = opened(self._device, self._settings, arm=arm, reason=self.status.reason)
+        self._on_found(self.found)
         self.latest = reading = self.found.reading
         offsets = [v - setpoint for v, setpoint in zip(reading.voltages, self.found.setpoints, strict=True)]
         self._writer.start(self.found.setpoints, offsets)
         self._writer.goal = None
+        self._resting = False
+        self.monitor.begin(self.found)
         if arm:
             self._set(State.ARMED)
         else:
-            self._set(State.HELD, held)
+            self._hold(held)
 
     def _lose(self, error: DeviceError) -> None:
         self.blocks.drop(str(error))
         self.counts.losses += not self.status.lost
         self._device.close()
+        self.monitor.commands.forget()
+        self._resting = False
         self._set(State.LOST, str(error))
         self._retry_ns = self._now_ns() + RETRY_NS
 
@@ -224,6 +268,6 @@ class DeviceLoop:
             self._open(arm=True)
             return True, f"goes on from {volts(*self._writer.written)} V"
         stopped = self.blocks.stop("by ~/stop")
-        self._set(State.HELD, "stopped by ~/stop; call ~/arm to go on")
+        self._hold("stopped by ~/stop; call ~/arm to go on")
         there = self._writer.written if stopped else self.latest.voltages if self.latest else ()
         return True, f"held at {volts(*there)} V; {stopped or 'no block was being played'}"

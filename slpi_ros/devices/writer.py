@@ -36,6 +36,8 @@ class LoopSettings:
     take_over_servo: bool = False
     rearm: bool = False
     rest: tuple[float, ...] | None = None  # V, to ramp to at the end; None: hold
+    silence: float = 0.0  # s without a command after which it holds; 0: it is no matter
+    silence_rest: tuple[float, ...] | None = None  # V, to ramp to after such a silence; None: hold
 
 
 class Writer:

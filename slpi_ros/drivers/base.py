@@ -2,13 +2,19 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Generator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import isnan, log10, nan
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.errors import SlpiError, UsageError, shown
 
 # Longest time that a device may take to accept a connection or to answer, seconds.
 TIMEOUT = 0.2
+# Metres for one unit of a position where neither device nor user says it.
+USUAL_SCALE = 1e-6
+# Metres of the units of length, by what devices call them in any case.
+UNITS = {"m": 1.0, "cm": 1e-2, "mm": 1e-3, "um": 1e-6, "µm": 1e-6, "\N{GREEK SMALL LETTER MU}m": 1e-6, "micron": 1e-6,
+         "nm": 1e-9, "pm": 1e-12}  # fmt: skip
 
 
 class DeviceError(SlpiError):
@@ -37,7 +43,7 @@ class Channel:
 
     name: str  # the device's name of the axis
     gain: float = 1.0  # V/V of an amplifier behind the device: volts at the stage for one volt of the device
-    scale: float = 1e-6  # m for one unit of the position that the device reports
+    scale: float = nan  # m for one unit of the position that the device reports; NaN: of the unit that it tells
     offset: float = 0.0  # m, added to it
 
     def stage_volts(self, voltage: float) -> float:
@@ -73,6 +79,8 @@ class Found:
     highest: tuple[float, ...]  # V; inf: not told
     servo: tuple[bool, ...]  # whether the device's own position control is on, so that it moves the voltage
     notes: tuple[str, ...] = ()  # what the user should know
+    units: tuple[str, ...] = ()  # of the positions, as the device calls them; () or "": not told
+    travel: tuple[float, ...] = ()  # m from end to end, as the device tells; () or NaN: not told
 
 
 @dataclass(frozen=True)
@@ -96,12 +104,36 @@ class Device(ABC):
     """A device with one or more channels; all voltages are those at the stage (V), all positions displacements (m).
 
     Every method raises a DeviceError; no single wait is longer than twice `TIMEOUT`. After an error only `open` and
-    `close` may be called. A device is used by one thread.
+    `close` may be called. A device is used by one thread. `channels` hold the scales in use, without NaN.
     """
 
     def __init__(self, kind: str, address: str, channels: Sequence[Channel]) -> None:
         self.name = f"{kind} {address}"
+        self._given = tuple(channels)
+        self.channels = tuple(replace(each, scale=_scale_or(each, USUAL_SCALE)) for each in channels)
+
+    def take_units(self, units: Sequence[str]) -> tuple[str, ...]:
+        """Take the scales of the channels from what the device calls the units of their positions, "": it does not say.
+
+        Return notes for the user; UnsuitableError where a unit is no length, or a given scale is of another one.
+        """
+        notes, channels = [], []
+        for channel, unit in zip(self._given, units, strict=True):
+            metres = UNITS.get(unit.strip().casefold())
+            what = f"{self.name}: axis '{channel.name}' counts in {shown(unit)}"
+            if unit and metres is None and isnan(channel.scale):
+                raise UnsuitableError(f"{what}, which is no known length; give sensor_scale, metres for one of it")
+            # Units of length are powers of ten apart; what is nearer to 1 is a correction of the sensor.
+            if metres and round(log10(abs(_scale_or(channel, metres)) / metres)):
+                raise UnsuitableError(
+                    f"{what}, {metres:g} m, but sensor_scale is {channel.scale:g}; leave sensor_scale out, or change "
+                    "the unit at the device"
+                )
+            channels.append(replace(channel, scale=_scale_or(channel, metres or USUAL_SCALE)))
+            if unit:
+                notes.append(f"axis '{channel.name}' counts in {shown(unit)}: sensor_scale {channels[-1].scale:g} m")
         self.channels = tuple(channels)
+        return tuple(notes)
 
     @abstractmethod
     def open(self) -> Found:
@@ -153,6 +185,11 @@ class Device(ABC):
     def write(self, voltages: Sequence[float]) -> Reading:
         """Write voltages (V); return what is read after them."""
         return self.exchange(voltages)
+
+
+def _scale_or(channel: Channel, scale: float) -> float:
+    """Return the scale (m) of a channel, another one where none was given."""
+    return scale if isnan(channel.scale) else channel.scale
 
 
 def host_and_port(kind: str, address: str, default: int) -> tuple[str, int]:

@@ -203,14 +203,18 @@ class GcsDevice(Device):
                 f"{self.name}: axis '{off}' is not controlled by commands (ONL? tells 0), so an analog input decides "
                 "its voltage; switch it over at the controller, knowing that this may move the stage"
             )
+        units = self._units()
+        notes += self.take_units(units)
         lowest = self._optional("VMI?", self._outputs, -math.inf)
         highest = self._optional("VMA?", self._outputs, math.inf)
+        travel: tuple[float, ...] = ()
         if "TMN?" in self._known and "TMX?" in self._known:
-            travel = [self._named(command, self._axes) for command in ("TMN?", "TMX?")]
+            ends = [self._named(command, self._axes) for command in ("TMN?", "TMX?")]
             notes += [
                 f"travel of {axis}: {low:g} to {high:g} in units of the device"
-                for axis, low, high in zip(self._axes, *travel, strict=True)
+                for axis, low, high in zip(self._axes, *ends, strict=True)
             ]
+            travel = tuple(abs(each.scale * (high - low)) for each, low, high in zip(self.channels, *ends, strict=True))
         reading = self.read()
         told = [each.device_volts(v) for each, v in zip(self.channels, reading.voltages, strict=True)]
         setpoints = self._named("SVA?", self._axes) if "SVA?" in self._known else told
@@ -228,7 +232,22 @@ class GcsDevice(Device):
             tuple(high for _, high in ranges),
             tuple(servo),
             tuple(notes),
+            tuple(units),
+            travel,
         )
+
+    def _units(self) -> list[str]:
+        """Return the unit of the position of each axis, "" where the controller does not tell it."""
+        lines = self._try(f"PUN? {' '.join(self._axes)}") if "PUN?" in self._known else []
+        if not lines:
+            return [""] * len(self._axes)
+        pairs = [line.partition("=") for line in lines]
+        if [name.strip() for name, _, _ in pairs] != self._axes:
+            raise AnswerError(
+                f"{self.name}: PUN? was asked for {', '.join(self._axes)} and answered "
+                f"'{shown(' '.join(lines), SHOWN)}'"
+            )
+        return [unit.strip() for _, _, unit in pairs]
 
     def _require_agreement(
         self, setpoints: Sequence[float], told: Sequence[float], lowest: Sequence[float], highest: Sequence[float]

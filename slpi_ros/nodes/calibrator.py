@@ -54,6 +54,10 @@ DECLARATIONS = declare.read_only(
     ),
     declare.path("output", "Folder for bags, model, diagnosis and page; required."),
     Declaration("resume", False, "Whether to go on with the complete bags that output holds already."),
+    Declaration(
+        "accept_units", False,
+        "Whether to go on where the stroke or the noise is none of a piezo stage, as of displacements in a wrong unit.",
+    ),
     Declaration("seed", 0, "Seed of the random parts of the drives.", between=(0, 2**31 - 1)),
     declare.STATE_TIMEOUT,
     declare.ACCEPT_STAGE,
@@ -146,7 +150,7 @@ def settings_of(values: Values) -> CalibrationSettings:
         budget=values["budget"] * len(axes),
         target=values["target"] * 1e-6,
         path=_path_of(values["desired_path"], axes, values["rate"]) if values["desired_path"] else {},
-        **{name: values[name] for name in ("rate", "times_repeatability", "seed", "accept_stage")},
+        **{name: values[name] for name in ("rate", "times_repeatability", "accept_stage", "accept_units", "seed")},
     )
 
 

@@ -1,6 +1,7 @@
 """Node ``device_simulator``: the protocol of a device, with a simulated stage behind it."""
 
 from functools import partial
+from typing import Any
 
 from rclpy.node import Node
 
@@ -8,6 +9,7 @@ from slpi_ros.errors import UsageError
 from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, validated
 from slpi_ros.simulation.devices.base import FAULTS, Fault, SimulatedDevice
+from slpi_ros.simulation.devices.gcs import UNITS
 from slpi_ros.simulation.devices.registry import SIMULATORS, make_simulator
 
 NO_FAULT = "none"
@@ -23,6 +25,7 @@ DECLARATIONS = (
         declare.scalar("noise_rms", 8e-9, "Sensor noise, metres rms.", (0.0, 1.0)),
         declare.scalar("voltage", 0.0, "Voltage at the outputs at the start, volts of the device.", declare.VOLTAGE),
         Declaration("servo", False, f"{', '.join(WITH_SERVO)}: whether the servo is on at the start."),
+        declare.text("unit", "UM", "gcs: the unit of its positions, as PUN? tells it.", *UNITS),
         declare.scalar("answer_delay", 0.0003, "Time until an answer, seconds.", (0.0, 10.0)),
     ),
     declare.text(
@@ -63,7 +66,9 @@ class DeviceSimulator(Node):
 
 def _started(values: Values) -> SimulatedDevice:
     """Return the simulator, which serves; UsageError if that does not go."""
-    own = {"servo": True} if values["servo"] and values["device"] in WITH_SERVO else {}
+    own: dict[str, Any] = {"servo": True} if values["servo"] and values["device"] in WITH_SERVO else {}
+    if values["device"] == "gcs":
+        own["unit"] = values["unit"]
     channels = [name for name in values["channels"] or () if name]
     given = (values[name] for name in ("seed", "noise_rms", "voltage", "answer_delay"))
     try:

@@ -1,5 +1,6 @@
 """Node ``driver``: a real amplifier and sensor on the topics of a stage."""
 
+import math
 import threading
 import time
 from dataclasses import dataclass, replace
@@ -17,10 +18,11 @@ from slpi_ros.devices.block import BlockPhase, BlockPlayer, BlockState
 from slpi_ros.devices.link import State
 from slpi_ros.devices.loop import DeviceLoop
 from slpi_ros.devices.writer import LoopSettings
-from slpi_ros.drivers.base import Channel, Reading
+from slpi_ros.drivers.base import USUAL_SCALE, Channel, Found, Reading
 from slpi_ros.drivers.registry import MODULES, make_device
-from slpi_ros.errors import SlpiError, UsageError, shown
+from slpi_ros.errors import RecordError, SlpiError, UsageError, shown
 from slpi_ros.io.messages import SECOND_NS, JointStateEncoder, encode_trajectory
+from slpi_ros.io.stage_name import device_name, stage_name
 from slpi_ros.model.limits import volts
 from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.common import (
@@ -36,6 +38,7 @@ from slpi_ros.nodes.common import (
     request_stop,
     steady_timer,
 )
+from slpi_ros.nodes.other_driver import OtherDriver
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, limits_of, validated
 
 HOLD, REST = "hold", "rest"
@@ -43,6 +46,8 @@ HOLD, REST = "hold", "rest"
 REPORT_PERIOD, LOOK_PERIOD, LOG_PERIOD = 0.5, 0.05, 5.0
 # Share of the cycles that may be left out without a warning.
 LATE_SHARE = 0.02
+# What to do about displacements that are none.
+WRONG_UNIT = "; check the unit of the device's position, and sensor_scale"
 # Characters of a device's own identity in messages.
 LONGEST_IDENTITY = 100
 
@@ -60,8 +65,9 @@ DECLARATIONS = declare.read_only(
         (1e-6, 1e6),
     ),
     declare.each_axis(
-        "sensor_scale", 1e-6,
-        "Displacement for one unit of the device's position, metres; negative where they count against each other.",
+        "sensor_scale", math.nan,
+        "Displacement for one unit of the device's position, metres; negative where they count against each other. "
+        f"NaN: of the unit that the device tells, {USUAL_SCALE:g} where it tells none.",
         (-1.0, 1.0),
     ),
     declare.each_axis("sensor_offset", 0.0, "Added to the displacement, metres.", (-1.0, 1.0)),
@@ -74,8 +80,25 @@ DECLARATIONS = declare.read_only(
         "at_exit", HOLD, "hold: the output stays as it is at the end. rest: it goes to rest_voltage at the slew limit.",
         HOLD, REST,
     ),
-    declare.each_axis("rest_voltage", 0.0, "Voltage to go to at the end, volts.", declare.VOLTAGE),
-    declare.text("hardware_id", "", "Identifier of the stage in stage_state; empty: what the device says of itself."),
+    declare.scalar(
+        "voltage_timeout", 5.0,
+        "Seconds without a voltage_command, from the last one that was carried out on, after which the output is held "
+        "and this is told; 0: never.",
+        (0.0, 86_400.0),
+    ),
+    declare.text(
+        "at_silence", HOLD,
+        "After voltage_timeout: hold: the output stays where it is. rest: it goes to rest_voltage at the slew limit, "
+        "and nothing moves until ~/arm, or with rearm the next command.",
+        HOLD, REST,
+    ),
+    declare.each_axis(
+        "rest_voltage", 0.0, "Voltage to go to at the end (at_exit) and at silence, volts.", declare.VOLTAGE
+    ),
+    declare.text(
+        "hardware_id", "",
+        "Identifier of the stage in stage_state; empty: model and serial number of the device, if it tells them.",
+    ),
     declare.REALTIME_PRIORITY,
 )  # fmt: skip
 
@@ -97,14 +120,21 @@ class DriverSettings:
                 f"parameter channels is {names!r}; give the device's name of each of the axes {', '.join(axes)}, each "
                 "once"
             )
-        if 0.0 in values["sensor_scale"]:
+        scales = values["sensor_scale"] or (math.nan,) * len(axes)
+        if 0.0 in scales:
             raise UsageError("parameter sensor_scale is 0; give metres for one unit of the device's position")
         limits = limits_of(values)
-        rest = values["rest_voltage"] if values["at_exit"] == REST else None
-        if rest and any(each.clip(v) != v for each, v in zip(limits, rest, strict=True)):
-            raise UsageError(f"parameter rest_voltage is {volts(*rest)} V; give it within voltage_min and voltage_max")
-        columns = (values[name] for name in ("amplifier_gain", "sensor_scale", "sensor_offset"))
-        loop = LoopSettings(tuple(axes), limits, values["rate"], values["take_over_servo"], values["rearm"], rest)
+        at_rest = tuple(values["rest_voltage"])
+        rest, silent = (at_rest if values[name] == REST else None for name in ("at_exit", "at_silence"))
+        if (rest or silent) and any(each.clip(v) != v for each, v in zip(limits, at_rest, strict=True)):
+            raise UsageError(
+                f"parameter rest_voltage is {volts(*at_rest)} V; give it within voltage_min and voltage_max"
+            )
+        columns = values["amplifier_gain"], scales, values["sensor_offset"]
+        loop = LoopSettings(
+            tuple(axes), limits, values["rate"], values["take_over_servo"], values["rearm"], rest,
+            values["voltage_timeout"], silent,
+        )  # fmt: skip
         return cls(values, tuple(map(Channel, names, *columns)), loop)
 
 
@@ -119,7 +149,8 @@ class Driver(Node):
 
     When the link is lost nothing is published; ``/diagnostics`` tells the device and since when. It is opened again
     until that succeeds; then it is read, and moved only after ``~/arm`` (std_srvs/Trigger), or with ``rearm``.
-    ``~/stop`` holds the output until ``~/arm``.
+    ``~/stop`` holds the output until ``~/arm``. After ``voltage_timeout`` without a command the output is held, or goes
+    to rest. Before anything it listens: it ends where another node reports this stage.
 
     A block on ``voltage_trajectory`` (trajectory_msgs/JointTrajectory, volts in ``effort``) is checked as a whole, then
     played by the device's clock, or streamed where the device cannot; ``voltage_trajectory_state`` tells how far it is,
@@ -134,11 +165,11 @@ class Driver(Node):
         device = make_device(values["device"], values["address"], settings.channels)
         self._device_name = device.name
         self._limits = dict(zip(values["axes"], settings.loop.limits, strict=True))
-        self._frame = values["hardware_id"]
+        self._frame: str = values["hardware_id"]
         self._encoder: JointStateEncoder | None = None
         self._publisher = self.create_publisher(JointState, "stage_state", COMMANDS)
         self._diagnostics = Diagnostics(self, "driver")
-        self._loop = DeviceLoop(device, settings.loop, self._publish)
+        self._loop = DeviceLoop(device, settings.loop, self._publish, on_found=self._on_found)
         self._failure: SlpiError | None = None
         self._status = self._loop.status
         self._reported_at, self._reported = time.monotonic(), replace(self._loop.counts)
@@ -149,9 +180,9 @@ class Driver(Node):
         self.create_subscription(JointTrajectory, "voltage_trajectory", self._on_trajectory, COMMANDS, raw=True)
         self._block_publisher = self.create_publisher(DiagnosticStatus, "voltage_trajectory_state", LATCHED)
         self._recording_publisher = self.create_publisher(JointTrajectory, "recorded_trajectory", COMMANDS)
+        self._other, self._listening = OtherDriver(self, "stage_state", values["axes"]), True
         steady_timer(self, LOOK_PERIOD, self._look)
         self._thread = threading.Thread(target=self._run, name=device.name, daemon=True)
-        self._thread.start()
         if values["realtime_priority"]:
             ask_for_priority(self, values["realtime_priority"])
 
@@ -169,12 +200,18 @@ class Driver(Node):
         try:
             self._loop.run()
         except SlpiError as error:
-            self._failure = error
+            heard = self._other.refusal(self._frame) if self._loop.found is None else None
+            self._failure = RecordError(f"{heard}; besides, {error}") if heard else error
+
+    def _on_found(self, found: Found) -> None:
+        """Name the stage; RecordError if it is reported by another node already."""
+        if self._encoder is None:
+            self._frame = self._values["hardware_id"] or shown(device_name(found.identity), LONGEST_IDENTITY)
+            if refusal := self._other.refusal(self._frame):
+                raise refusal
 
     def _publish(self, reading: Reading) -> None:
         if self._encoder is None:
-            assert self._loop.found is not None
-            self._frame = self._frame or shown(self._loop.found.identity, LONGEST_IDENTITY)
             self._encoder = JointStateEncoder(self._values["axes"], self._frame)
         age_ns = time.monotonic_ns() - reading.read_ns
         stamp_ns = self.get_clock().now().nanoseconds - age_ns
@@ -218,7 +255,10 @@ class Driver(Node):
         return ""
 
     def _look(self) -> None:
-        """Pass on what the thread of the device has done."""
+        """Pass on what the thread of the device has done; let it begin once nobody else is heard."""
+        if self._listening:
+            self._begin()
+            return
         if self._failure is not None:
             request_stop(self._failure)
             return
@@ -236,6 +276,18 @@ class Driver(Node):
         self._status = status
         if changed or now - self._reported_at >= REPORT_PERIOD:
             self._report(now)
+
+    def _begin(self) -> None:
+        """Let the thread of the device begin, unless another node is heard that reports this stage."""
+        if not self._other.done:
+            return
+        self._listening = False
+        # Without a name of its own only the device can tell whether it is another stage.
+        named = self._frame or not all(map(stage_name, self._other.frames))
+        if named and (refusal := self._other.refusal(self._frame)):
+            request_stop(refusal)
+        else:
+            self._thread.start()
 
     def _tell(self) -> None:
         """Log a new state."""
@@ -263,6 +315,9 @@ class Driver(Node):
             problems.append((ERROR, f"no link since {since}: {status.reason}"))
         elif status.state is State.HELD:
             problems.append((WARN, f"held since {since}: {status.reason}"))
+        for each in loop.monitor.standing:
+            remedy = f": held at {volts(*loop.written)} V" if each.rule == "commands" else WRONG_UNIT
+            problems.append((WARN, f"{each}{remedy}"))
         for axis in loop.limited:
             limits = self._limits[axis]
             problems.append(

@@ -15,6 +15,7 @@ from rclpy.qos import QoSProfile
 from sensor_msgs.msg import JointState
 from std_msgs.msg import String
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.document import parse_model
@@ -42,6 +43,7 @@ class _Probe:
         self._state, self._command = (node.resolve_topic_name(topic) for topic in (state_topic, command_topic))
         self._times: list[tuple[float, float]] = []
         self._last: JointState | None = None
+        self._states: list[JointState] = []
         self._models: list[String] = []
 
     def watch(self, seconds: float) -> Graph:
@@ -78,12 +80,23 @@ class _Probe:
             last.header.frame_id,
             self._limits(next(iter(commanding))) if len(commanding) == 1 else {},
             model,
+            {axis: self._readings(axis) for axis in last.name},
         )
 
     def _on_state(self, state: JointState) -> None:
         stamp = state.header.stamp
         self._times.append((stamp.sec + stamp.nanosec * 1e-9, self._node.get_clock().now().nanoseconds / SECOND_NS))
         self._last = state
+        self._states.append(state)
+
+    def _readings(self, axis: str) -> tuple[FloatArray, FloatArray]:
+        """Return the voltages (V) and displacements (m) of an axis in all states, (N,)."""
+        rows = []
+        for state in self._states:
+            v, y = (dict(zip(state.name, values, strict=False)) for values in (state.effort, state.position))
+            rows.append((v.get(axis, math.nan), y.get(axis, math.nan)))
+        voltage, displacement = np.array(rows).T
+        return voltage, displacement
 
     def _spin(self, seconds: float, done: Any = lambda: False) -> None:
         end = time.monotonic() + seconds

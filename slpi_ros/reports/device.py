@@ -3,7 +3,10 @@
 import math
 from collections.abc import Sequence
 
-from slpi_ros.drivers.base import Found
+from slpi_ros.arrays import FloatArray
+from slpi_ros.compensator.plausible import implausible_noise, implausible_stroke
+from slpi_ros.drivers.base import USUAL_SCALE, Found
+from slpi_ros.errors import shown
 from slpi_ros.reports.doctor import FAILED, NOTE, OK, Check
 
 # The limits to start with: so far on each side of the present voltage, V, but no more than this share of the device's
@@ -11,12 +14,12 @@ from slpi_ros.reports.doctor import FAILED, NOTE, OK, Check
 NARROW, NARROW_SHARE = 5.0, 0.05
 # Cycles per second to choose from: a reading shall take at most half a period, as writing may take as long again.
 RATES = (1000, 500, 200, 100, 50, 20)
-# Metres to start with for one unit of the position: 1 um; where that is the voltage of a sensor, 100 um for 10 V.
-SCALE, SENSOR_SCALES = 1e-6, {"labjack": 1e-5, "nidaqmx": 1e-5}
+# Metres to start with for one unit of a position that is the voltage of a sensor: 100 um for 10 V.
+SENSOR_SCALES = {"labjack": 1e-5, "nidaqmx": 1e-5}
 
 
-def check_device(name: str, found: Found, channels: Sequence[str]) -> list[Check]:
-    """Return the checks of an open device, its channels one by one."""
+def check_device(name: str, found: Found, channels: Sequence[str], positions: FloatArray) -> list[Check]:
+    """Return the checks of an open device, its channels one by one; `positions` (m, (N, channels)) were read of it."""
     checks = [Check(OK, f"{name}: {found.identity}; nothing was written")]
     rows = zip(
         channels,
@@ -43,6 +46,13 @@ def check_device(name: str, found: Found, channels: Sequence[str]) -> list[Check
             )
         if not math.isfinite(x):
             checks.append(Check(NOTE, f"{told}: no position: no calibration is possible with this device alone"))
+        place = channels.index(channel)
+        travel = implausible_stroke(found.travel[place]) if found.travel else ""
+        if unit := travel or implausible_noise(positions[:, place]):
+            checks.append(
+                Check(FAILED, f"{told}: {unit}: no piezo stage has that; check the unit of its position, and set "
+                              "sensor_scale")
+            )  # fmt: skip
         if abs(setpoint - v) > 1e-3 * max(abs(v), 1.0):
             checks.append(
                 Check(NOTE, f"{told}: it was told {setpoint:.6g} V and says {v:.6g} V: the first step may be as large")
@@ -50,16 +60,17 @@ def check_device(name: str, found: Found, channels: Sequence[str]) -> list[Check
     return checks + [Check(NOTE, f"{name}: {note}") for note in found.notes]
 
 
-def device_table(found: Found, channels: Sequence[str]) -> list[str]:
-    """Return a table of the channels of a device, in volts and units of the device."""
+def device_table(found: Found, channels: Sequence[str], scales: Sequence[float]) -> list[str]:
+    """Return a table of the channels of a device, in volts and units of the device, of which one is `scales` (m)."""
     rows = [("channel", "voltage", "position, its unit", "own range", "servo")]
     for place, channel in enumerate(channels):
-        x = found.reading.positions[place]
+        x = found.reading.positions[place] / scales[place]
+        unit = found.units[place] if found.units else ""
         rows.append(
             (
                 channel,
                 f"{found.reading.voltages[place]:.4f} V",
-                f"{x:.6g}" if math.isfinite(x) else "none",
+                f"{x:.6g} {shown(unit)}".strip() if math.isfinite(x) else "none",
                 f"{found.lowest[place]:g} to {found.highest[place]:g} V",
                 "ON" if found.servo[place] else "off",
             )
@@ -81,8 +92,13 @@ def device_parameters(kind: str, address: str, found: Found, channels: Sequence[
     # With quotation marks: YAML takes a bare y for a boolean.
     names, texts = (", ".join(f"'{each}'" for each in some) for some in (axes[: len(channels)], channels))
     rate = next((each for each in RATES if cycle <= 0.5 / each), RATES[-1])
-    scale = SENSOR_SCALES.get(kind, SCALE)
+    scale = SENSOR_SCALES.get(kind, USUAL_SCALE)
     unit = "V; here 10 V for 100 um" if kind in SENSOR_SCALES else "here 1 um"
+    scaled = [f"    # Metres for one unit of the position in the table ({unit}).", f"    sensor_scale: {scale:.1e}"]
+    if any(found.units):
+        told = ", ".join(map(shown, found.units))
+        scaled = ["    # Metres for one unit of the position; .nan: " + f"as the device tells ({told}).",
+                  "    sensor_scale: .nan"]  # fmt: skip
     return [
         "driver:",
         "  ros__parameters:",
@@ -99,6 +115,5 @@ def device_parameters(kind: str, address: str, found: Found, channels: Sequence[
         "    # V at the stage for one volt of the device: of an amplifier behind it. Set it before anything moves, and",
         "    # multiply the limits above by it.",
         "    amplifier_gain: 1.0",
-        f"    # Metres for one unit of the position in the table ({unit}).",
-        f"    sensor_scale: {scale:.1e}",
+        *scaled,
     ]

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from math import nan
 from typing import Any
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from slpi_ros.arrays import FloatArray
 from slpi_ros.calibration.drive_monitor import FARTHEST
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
+from slpi_ros.compensator.plausible import implausible
 from slpi_ros.identification.record_quality import assess, findings
 from slpi_ros.io.record import Record
 from slpi_ros.io.stage_name import same_stage, stage_name
@@ -23,6 +25,7 @@ STATE_TYPE = "sensor_msgs/msg/JointState"
 JITTER, GAP = 0.5, 5.0
 # Seconds by which a stamp may lie before and after the time of its arrival.
 OLDEST, NEWEST = 0.1, 0.01
+NO_STAGE = "which no piezo stage has: displacements are in metres; check the unit and sensor_scale of the driver"
 # Fewest states from which a rate is told.
 FEWEST = 10
 
@@ -66,6 +69,7 @@ class Graph:
     hardware_id: str = ""
     limits: Mapping[str, Range] = field(default_factory=dict)  # V, of the node that publishes the voltages; {}: untold
     model: StageModel | None = None  # on ``stage_model``
+    readings: Mapping[str, tuple[FloatArray, FloatArray]] = field(default_factory=dict)  # V, m, (N,), of all states
 
 
 def check_record(record: Record, model: StageModel | None = None, limits: Range | None = None) -> list[Check]:
@@ -79,6 +83,9 @@ def _of_record(record: Record, model: StageModel | None, limits: Range | None) -
             yield Check(OK if finding.level == "ok" else FAILED, f"axis {axis}: {finding.text}")
         v = record.voltage[axis]
         reached = float(np.nanmin(v)), float(np.nanmax(v))
+        units = implausible(v, record.displacement[axis], limits[1] - limits[0] if limits else nan)
+        if units:
+            yield Check(FAILED, f"axis {axis}: {units}, {NO_STAGE}")
         if limits is not None:
             yield _within(axis, "the voltage went", reached, limits, "the limits", "correct the limits or the driver")
         if model is not None and axis in model.axes:
@@ -194,10 +201,18 @@ def _of_values(graph: Graph) -> Iterator[Check]:
             yield Check(FAILED, f"{topic}: {text}")
         elif abs(y) > FARTHEST:
             yield Check(FAILED, f"{topic}: axis {axis}: position {y:.4g} is no displacement in metres; publish metres")
+        elif units := _units(graph, axis):
+            yield Check(FAILED, f"{topic}: axis {axis}: {units}, {NO_STAGE}")
         else:
             yield Check(OK, f"{topic}: axis {axis} at {y * 1e6:.4g} µm, {v:.4g} V")
     if not stage_name(graph.hardware_id):
         yield Check(NOTE, f"{topic}: without a hardware id in header.frame_id: models cannot be told apart by stage")
+
+
+def _units(graph: Graph, axis: str) -> str:
+    """Return what is implausible of the readings of an axis, "" if nothing is."""
+    low, high = graph.limits.get(axis, (nan, nan))
+    return implausible(*graph.readings[axis], high - low) if axis in graph.readings else ""
 
 
 def _of_commands(graph: Graph) -> Iterator[Check]:

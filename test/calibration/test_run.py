@@ -52,6 +52,34 @@ def test_a_stage_that_does_not_follow_is_not_driven_further(spoil):
     assert [request.name for request in recorder.requests] == ["01_check"]
 
 
+WRONG_UNITS = {
+    "millimetres for micrometres": lambda v, y: (v, 1e-3 * y),
+    "nanometres for micrometres": lambda v, y: (v, 1e3 * y),
+    "noise of no sensor": lambda v, y: (v, 1e-6 * v + 1e-14 * np.random.default_rng(0).standard_normal(v.size)),
+}
+
+
+@pytest.mark.parametrize("name", WRONG_UNITS)
+def test_a_stroke_or_noise_of_no_stage_is_not_driven_further(name):
+    recorder = Spoiled(WRONG_UNITS[name])
+    with pytest.raises(RecordError, match="accept_units"):
+        calibrate(settings(), recorder)
+    assert [request.name for request in recorder.requests] == ["01_check"]
+    lowest, highest = (each(recorder.requests[0].drive.voltage["x"]) for each in (np.min, np.max))
+    assert highest - lowest < 50.0
+
+
+def test_it_goes_on_where_the_units_are_accepted():
+    class Until(Spoiled):
+        def __call__(self, request):
+            if request.name != "01_check":
+                raise Ended
+            return super().__call__(request)
+
+    with pytest.raises(Ended):
+        calibrate(settings(accept_units=True), Until(WRONG_UNITS["millimetres for micrometres"]))
+
+
 def test_a_record_that_allows_no_fit_ends_it():
     class Coarse(SimulatedRecorder):
         def __call__(self, request):

@@ -14,6 +14,7 @@ from slpi_ros.drivers.registry import make_device
 from slpi_ros.model.limits import Limits
 from slpi_ros.simulation.devices.base import FAULTS, LATE, SILENT, Fault
 from slpi_ros.simulation.devices.gcs import GcsSimulator
+from slpi_ros.simulation.stage import Stage
 
 RATE, SLEW = 1000.0, 500.0
 STEP = SLEW / RATE
@@ -317,3 +318,133 @@ def test_the_end_while_the_link_is_lost():
 
 def test_errors_of_devices_are_shown_as_one_line():
     assert "\n" not in str(DeviceError("gcs host: it sent '\n\x1b[2J'"))
+
+
+SILENCE = 0.5
+QUIET = int(SILENCE * RATE)
+
+
+def rules(at):
+    return {found.rule for found in at.loop.monitor.standing}
+
+
+@pytest.mark.parametrize("rearm", [False, True])
+def test_a_silence_of_the_commands_holds_and_is_told_until_the_next_one(rearm):
+    with bench(voltages=[20.0], settings={"silence": SILENCE, "rearm": rearm}) as at:
+        at.turn(3 * QUIET)
+        assert rules(at) == set()
+        at.reach(30.0)
+        at.turn(QUIET // 2)
+        assert rules(at) == set()
+        at.turn(QUIET)
+        assert rules(at) == {"commands"} and at.loop.status.armed
+        assert at.simulator.voltage("1") == 30.0
+        at.reach(40.0)
+        at.turn(60)
+        assert rules(at) == set()
+
+
+def test_a_way_that_is_not_at_its_end_is_held_where_it_is():
+    with bench(limits=[Limits(0.0, 100.0, 50.0)], voltages=[20.0], settings={"silence": SILENCE}) as at:
+        at.turn()
+        assert at.loop.command([100.0]) == ""
+        at.turn(2 * QUIET)
+        reached = at.simulator.voltage("1")
+        assert 20.0 + 50.0 * SILENCE <= reached <= 20.0 + 50.0 * (SILENCE + 0.1)
+        at.turn(QUIET)
+        assert at.simulator.voltage("1") == reached
+
+
+def test_commands_that_are_rejected_do_not_break_a_silence():
+    with bench(settings={"silence": SILENCE}) as at:
+        at.turn()
+        at.reach(10.0)
+        for _ in range(2 * QUIET):
+            assert at.loop.command([float("nan")])
+            at.turn()
+        assert rules(at) == {"commands"}
+
+
+def test_without_a_timeout_silence_is_no_matter():
+    with bench(settings={"silence": 0.0, "silence_rest": (0.0,)}) as at:
+        at.turn()
+        at.reach(10.0)
+        at.turn(10 * QUIET)
+        assert rules(at) == set() and at.simulator.voltage("1") == 10.0
+
+
+def test_rest_after_a_silence_keeps_the_slew_limit_and_then_needs_to_be_armed():
+    with bench(voltages=[20.0], settings={"silence": SILENCE, "silence_rest": (5.0,)}) as at:
+        at.turn()
+        at.reach(80.0)
+        at.turn_until(lambda: at.simulator.voltage("1") < 75.0)
+        assert at.loop.status.state is State.HELD and "no voltage_command" in at.loop.status.reason
+        assert "~/arm" in at.loop.command([50.0])
+        assert 5.0 < at.simulator.voltage("1") < 80.0
+        at.turn_until(lambda: at.simulator.voltage("1") == 5.0)
+        at.turn(QUIET)
+        assert at.loop.command([50.0]) and at.simulator.voltage("1") == 5.0
+        assert at.answer("arm")[1]
+        at.turn(3 * QUIET)
+        # Armed anew, nothing is awaited before the first command.
+        assert rules(at) == set() and at.loop.status.armed
+        at.reach(50.0)
+        assert at.largest_step <= 2.0 * STEP + ROUNDING
+
+
+def test_with_rearm_the_next_command_is_taken_on_the_way_to_rest():
+    with bench(voltages=[20.0], settings={"silence": SILENCE, "silence_rest": (5.0,), "rearm": True}) as at:
+        at.turn()
+        at.reach(80.0)
+        at.turn_until(lambda: at.simulator.voltage("1") < 75.0)
+        assert at.loop.status.armed and rules(at) == {"commands"}
+        assert 5.0 < at.simulator.voltage("1") < 80.0
+        at.reach(70.0)
+        at.turn_until(lambda: at.simulator.voltage("1") == 5.0)
+        assert at.largest_step <= 2.0 * STEP + ROUNDING
+
+
+def test_a_stop_and_an_arming_on_the_way_to_rest_stay_there():
+    for what in ("stop", "arm"):
+        with bench(voltages=[20.0], settings={"silence": SILENCE, "silence_rest": (5.0,)}) as at:
+            at.turn()
+            at.reach(80.0)
+            at.turn_until(lambda: at.simulator.voltage("1") < 75.0)
+            assert at.answer(what)[1]
+            there = at.simulator.voltage("1")
+            at.turn(QUIET)
+            assert at.simulator.voltage("1") == there > 5.0
+
+
+def test_a_lost_link_ends_the_way_to_rest():
+    with bench(voltages=[20.0], settings={"silence": SILENCE, "silence_rest": (5.0,)}) as at:
+        at.turn()
+        at.reach(80.0)
+        at.turn_until(lambda: at.simulator.voltage("1") < 75.0)
+        at.simulator.fault = Fault(SILENT)
+        at.turn()
+        assert at.loop.status.lost
+        there = at.simulator.voltage("1")
+        at.turn_until(lambda: at.loop.status.state is State.HELD)
+        at.turn(QUIET)
+        assert at.simulator.voltage("1") == there
+
+
+@pytest.mark.parametrize(
+    ("device", "told"), [({"unit": "MM"}, set()), ({"unit": "MM", "without": ["PUN?"]}, {"units"})]
+)
+def test_a_controller_that_counts_in_millimetres(device, told):
+    with bench(voltages=[20.0], **device) as at:
+        at.turn(60)
+        assert rules(at) == told
+
+
+def test_a_stroke_that_is_none_is_told_once_it_was_seen():
+    without = ["PUN?", "TMN?", "TMX?"]
+    with bench(voltages=[20.0], unit="MM", without=without, stage=Stage.random(["1"], 1, 8e-9)) as at:
+        at.turn(500)
+        assert rules(at) == set()
+        for goal in (80.0, 20.0):
+            at.reach(goal)
+            at.turn(400)
+        assert rules(at) == {"units"} and at.loop.status.armed

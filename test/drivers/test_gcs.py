@@ -55,7 +55,7 @@ def test_opening_only_asks():
         asked = {line.split()[0] for line in simulator.received}
     assert asked == {
         "*IDN?", "HLP?", "SAI?", "SVO?", "ONL?", "VOL?", "SVA?", "VMI?", "VMA?", "TMN?", "TMX?", "POS?", "ERR?",
-        "SPA?", "WGO?",
+        "PUN?", "SPA?", "WGO?",
     }  # fmt: skip
     assert found.setpoints == found.reading.voltages == (37.5, -3.0)
     assert (found.lowest, found.highest, found.servo) == ((-20.0, -20.0), (120.0, 120.0), (False, False))
@@ -73,7 +73,7 @@ def test_what_a_controller_has_not_got_is_left_out():
 
 def test_a_cycle_writes_and_reads_in_units_of_the_stage():
     channels = [Channel("2", gain=10.0, scale=-1e-9, offset=1e-3), Channel("1")]
-    with GcsSimulator(["1", "2"]) as simulator:
+    with GcsSimulator(["1", "2"], without=["PUN?"]) as simulator:
         device = device_at(simulator, *channels)
         found = device.open()
         reading = device.write([80.0, 30.0])
@@ -83,6 +83,58 @@ def test_a_cycle_writes_and_reads_in_units_of_the_stage():
     assert reading.voltages == (80.0, 30.0)
     assert found.highest == (1200.0, 120.0)
     assert reading.positions == pytest.approx([1e-3 - 1e-3 * told[1], told[0]], abs=1e-9)
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("MM", 1e-3), ("UM", 1e-6), ("NM", 1e-9)])
+def test_the_unit_is_what_the_controller_tells(unit, scale):
+    with GcsSimulator(unit=unit, voltages=[40.0]) as simulator:
+        device = device_at(simulator)
+        found = device.open()
+        assert device.channels[0].scale == scale
+        assert found.units == (unit,)
+        assert found.travel == pytest.approx((25e-6,))
+        # Of millimetres six decimals are a nanometre.
+        assert found.reading.positions == pytest.approx(simulator.move(), abs=2e-9)
+
+
+@pytest.mark.parametrize("given", [1e-6, -1e-6, 1e-9, 1.0])
+def test_a_scale_of_another_unit_is_refused(given):
+    with GcsSimulator(unit="MM") as simulator, pytest.raises(UnsuitableError, match="MM.*sensor_scale") as refused:
+        device_at(simulator, Channel("1", scale=given)).open()
+    assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize("given", [1e-6, -1e-6, 1.02e-6])
+def test_a_sign_and_a_correction_are_no_other_unit(given):
+    with GcsSimulator() as simulator:
+        device = device_at(simulator, Channel("1", scale=given))
+        device.open()
+        assert device.channels[0].scale == given
+
+
+def test_without_the_question_it_is_a_micrometre_or_what_is_given():
+    with GcsSimulator(["1", "2"], without=["PUN?"]) as simulator:
+        device = device_at(simulator, Channel("1"), Channel("2", scale=1e-3))
+        found = device.open()
+        assert "PUN?" not in {line.split()[0] for line in simulator.received}
+    assert [channel.scale for channel in device.channels] == [1e-6, 1e-3]
+    assert found.units == ("", "")
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("µm", 1e-6), ("um", 1e-6), ("Micron", 1e-6), ("M", 1.0)])
+def test_units_by_their_other_names(unit, scale):
+    device = make_device("gcs", "192.0.2.1", [Channel("1")])
+    device.take_units([unit])
+    assert device.channels[0].scale == scale
+
+
+def test_a_unit_that_is_no_length_needs_a_scale():
+    device = make_device("gcs", "192.0.2.1", [Channel("1"), Channel("2", scale=1e-7)])
+    with pytest.raises(UnsuitableError, match="MRAD.*sensor_scale"):
+        device.take_units(["MRAD", "MRAD"])
+    device = make_device("gcs", "192.0.2.1", [Channel("2", scale=1e-7)])
+    device.take_units(["MRAD"])
+    assert device.channels[0].scale == 1e-7
 
 
 @pytest.mark.parametrize("kind", FAULTS)

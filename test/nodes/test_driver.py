@@ -4,6 +4,8 @@ import os
 import re
 import signal
 import socket
+import subprocess
+import sys
 from contextlib import contextmanager
 
 import numpy as np
@@ -238,3 +240,133 @@ def test_a_misspelt_parameter_is_told():
     finally:
         process.kill()
     assert "slew_limt" in said and "slew_limit" in said
+
+
+def test_when_commands_cease_it_holds_and_says_so():
+    with GcsSimulator(voltages=[20.0]) as simulator, driver(simulator.address, voltage_timeout=1.0) as bench:
+        bench.connect()
+        quiet = bench.status("armed")
+        assert "voltage_command" not in quiet.message
+        bench.reach(40.0)
+        told = bench.graph.wait_for_status(
+            "/driver: driver", lambda status: "no voltage_command" in status.message, "the silence"
+        )
+        assert told.level == DiagnosticStatus.WARN and values_of(told)["state"] == "armed"
+        assert simulator.voltage("1") == 40.0
+        bench.reach(50.0)
+        bench.graph.wait_for_status(
+            "/driver: driver", lambda status: "no voltage_command" not in status.message, "commands again"
+        )
+
+
+COMMANDER = """
+import time, rclpy
+from std_msgs.msg import Float64MultiArray
+rclpy.init()
+node = rclpy.create_node("commander")
+publisher = node.create_publisher(Float64MultiArray, "voltage_command", 10)
+while True:
+    publisher.publish(Float64MultiArray(data=[70.0]))
+    time.sleep(0.01)
+"""
+
+
+def test_a_commander_that_dies_leaves_the_stage_at_rest():
+    rest = {"voltage_timeout": 1.0, "at_silence": "rest", "rest_voltage": 10.0}
+    with GcsSimulator(voltages=[20.0]) as simulator, driver(simulator.address, **rest) as bench:
+        bench.connect()
+        commander = subprocess.Popen([sys.executable, "-c", COMMANDER])
+        try:
+            bench.graph.spin_until(lambda: bench.states[-1].effort[0] == 70.0, "70 V")
+        finally:
+            commander.kill()
+            commander.wait()
+        held = bench.status("held")
+        assert held.level == DiagnosticStatus.WARN and "~/arm" in held.message
+        bench.graph.spin_until(lambda: bench.states[-1].effort[0] == 10.0, "rest")
+        assert largest_step(simulator, 20.0) <= LARGEST_STEP
+        # Whoever comes back does not move it.
+        before = int(values_of(held)["commands_rejected"])
+        for _ in range(5):
+            bench.commands.publish(Float64MultiArray(data=[50.0]))
+        bench.graph.wait_for_status(
+            "/driver: driver", lambda status: int(values_of(status)["commands_rejected"]) >= before + 5, "a rejection"
+        )
+        assert simulator.voltage("1") == 10.0
+        assert bench.call("arm").success
+        bench.reach(50.0)
+
+
+def test_a_unit_that_is_none_of_a_stage_is_told():
+    with (
+        GcsSimulator(unit="MM", without=["PUN?"]) as simulator,
+        driver(simulator.address) as bench,
+    ):
+        told = bench.status("armed")
+        assert told.level == DiagnosticStatus.WARN and "25 nm" in told.message and "sensor_scale" in told.message
+
+
+def ends(parameters):
+    """Return the exit code of a driver, and what it says."""
+    process = NodeProcess("driver", {"device": "gcs", **LIMITS, **parameters}, ())
+    try:
+        return process.wait(), process.stderr
+    finally:
+        process.kill()
+
+
+SERIALS = "E-727.SIMULATED, serial number {}"
+
+
+@pytest.mark.parametrize(
+    ("first", "second"),
+    [
+        ({"hardware_id": "P-611"}, {"hardware_id": "P-611"}),
+        ({}, {}),
+        ({"hardware_id": SERIALS.format(7)}, {}),
+        ({"hardware_id": "world"}, {}),
+    ],
+)
+def test_a_second_driver_of_a_stage_does_not_begin(first, second):
+    with (
+        GcsSimulator(serial="7") as simulator,
+        GcsSimulator(serial="7") as other,
+        driver(simulator.address, **first) as bench,
+    ):
+        bench.connect()
+        code, said = ends({"address": other.address, **second})
+        assert code == 1 and "/driver" in said and len(said.splitlines()) == 1
+        assert other.log == [] and bench.status("armed")
+
+
+@pytest.mark.parametrize(
+    ("first", "second"), [({"hardware_id": "A"}, {"hardware_id": "B"}), ({}, {}), ({}, {"axes": ["y"]})]
+)
+def test_another_stage_or_axis_beside_begins(first, second):
+    with (
+        GcsSimulator(serial="7") as simulator,
+        GcsSimulator(serial="7" if "axes" in second else "8") as other,
+        driver(simulator.address, **first) as bench,
+    ):
+        own = bench.connect().states[-1]
+        given = {"device": "gcs", "address": other.address, **LIMITS, **second}
+
+        def heard():
+            return any((each.header.frame_id, each.name) != (own.header.frame_id, own.name) for each in bench.states)
+
+        with started("driver", given):
+            bench.graph.spin_until(heard, "the other stage")
+
+
+def test_a_driver_whose_device_is_in_use_names_the_other():
+    with GcsSimulator() as simulator, driver(simulator.address) as bench:
+        bench.connect()
+        code, said = ends({"address": simulator.address})
+        assert code == 1 and "/driver" in said and simulator.address in said and len(said.splitlines()) == 1
+
+
+def test_the_name_of_a_stage_is_the_number_of_its_device():
+    with GcsSimulator(serial="0042") as simulator, driver(simulator.address) as bench:
+        assert bench.connect().states[0].header.frame_id == SERIALS.format("0042")
+    with GcsSimulator(serial="0") as simulator, driver(simulator.address) as bench:
+        assert bench.connect().states[0].header.frame_id == ""

@@ -42,6 +42,7 @@ def test_what_is_well_needs_nothing(record, model):
 
 
 STAMPS = graph().stamps
+RAMP, NOISE = np.linspace(0.0, 30.0, 600), 5e-9 * np.random.default_rng(1).standard_normal(600)
 FAULTS = {
     "nobody": ({"nodes": []}, "ROS_DOMAIN_ID"),
     "no driver": ({"state_publishers": {}, "stamps": STAMPS[:0], "arrivals": STAMPS[:0]}, "no publisher"),
@@ -56,6 +57,8 @@ FAULTS = {
     "gap": ({"stamps": np.concatenate([STAMPS[:300], STAMPS[300:] + 0.2]), "arrivals": STAMPS + 0.1}, "gap"),
     "jitter": ({"stamps": STAMPS + 4e-3 * (np.arange(STAMPS.size) % 2)}, "jitter"),
     "micrometres": ({"displacement": {"x": 5.0}}, "metres"),
+    "millimetres": ({"readings": {"x": (RAMP, 1e-3 * (0.2e-6 * RAMP + NOISE))}}, "nm"),
+    "noise of no sensor": ({"readings": {"x": (0.0 * RAMP, 1e-6 * NOISE)}}, "noise"),
     "no voltage": ({"voltage": {}}, "effort"),
     "two commanders": ({"command_publishers": ["/compensator", "/exciter"]}, "/exciter"),
     "no amplifier": ({"command_subscribers": []}, "no subscriber"),
@@ -95,3 +98,6 @@ def test_faults_of_a_record(record, model):
         record.time_ns[kept], {"x": record.voltage["x"][kept]}, {"x": record.displacement["x"][kept]}, hardware_id="s1"
     )
     assert to_mend(check_record(cut, model))
+    wrong = replace(record, displacement={"x": 1e-3 * record.displacement["x"]})
+    (unit,) = [text for text in to_mend(check_record(wrong)) if "sensor_scale" in text]
+    assert "nm" in unit

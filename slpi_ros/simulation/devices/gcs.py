@@ -13,12 +13,16 @@ from slpi_ros.simulation.devices.gcs_waves import SimulatedWaves
 from slpi_ros.simulation.devices.stream import StreamSimulator
 from slpi_ros.simulation.stage import Stage
 
-IDENTITY = "(c)2020 Physik Instrumente (PI) GmbH & Co. KG, E-727.SIMULATED, 0123456789, 13.21.00.09"
+IDENTITY = "(c)2020 Physik Instrumente (PI) GmbH & Co. KG, E-727.SIMULATED, {serial}, 13.21.00.09"
+SERIAL = "0123456789"
 COMMANDS = (
-    "*IDN?", "ERR?", "HLP?", "ONL?", "POS?", "SAI?", "SVA", "SVA?", "SVO", "SVO?", "TMN?", "TMX?", "VMA?", "VMI?",
-    "VOL?", "WAV", "WSL", "WGC", "WTR", "WGO", "WGO?", "WGI?", "SPA?", "RTR", "DRC", "DRR?",
+    "*IDN?", "ERR?", "HLP?", "ONL?", "POS?", "PUN?", "SAI?", "SVA", "SVA?", "SVO", "SVO?", "TMN?", "TMX?", "VMA?",
+    "VMI?", "VOL?", "WAV", "WSL", "WGC", "WTR", "WGO", "WGO?", "WGI?", "SPA?", "RTR", "DRC", "DRR?",
 )  # fmt: skip
 MICROMETRE = 1e-6
+# Metres of the units in which it counts.
+UNITS = {"MM": 1e-3, "UM": MICROMETRE, "NM": 1e-9}
+TRAVEL = 25.0 * MICROMETRE
 
 
 class GcsSimulator(StreamSimulator):
@@ -33,6 +37,8 @@ class GcsSimulator(StreamSimulator):
     servo : whether the servo is on at the start
     units_per_volt : of ``SVA``, which is not in volts on every controller
     without : commands that this controller has not got
+    unit : in which it counts positions, and which ``PUN?`` tells; one of `UNITS`
+    serial : its serial number
     answer_delay : time until an answer, s
     place : host and port, or the path of a pseudo terminal
     """
@@ -50,6 +56,8 @@ class GcsSimulator(StreamSimulator):
         servo: bool = False,
         units_per_volt: float = 1.0,
         without: Sequence[str] = (),
+        unit: str = "UM",
+        serial: str = SERIAL,
         answer_delay: float = 0.0,
         **place: Any,
     ) -> None:
@@ -59,22 +67,24 @@ class GcsSimulator(StreamSimulator):
         self.servo = dict.fromkeys(self.axes, servo)
         self.online = dict.fromkeys(self.axes, True)
         self.units_per_volt = units_per_volt
+        self.metres = UNITS[unit]
         self._known = [command for command in COMMANDS if command not in without]
         self._outputs = {str(place): axis for place, axis in enumerate(self.axes, 1)}
         self._error = 0
         self._handlers: dict[str, Callable[[list[str]], list[str]]] = {
-            "*IDN?": lambda _: [IDENTITY],
+            "*IDN?": lambda _: [IDENTITY.format(serial=serial)],
             "ERR?": self._tell_error,
             "HLP?": lambda _: ["The following commands are available:", *self._known, "end of help"],
             "ONL?": lambda given: self._tell_output(given, lambda axis: str(int(self.online[axis]))),
             "POS?": self._tell_positions,
+            "PUN?": lambda given: self._tell(given, lambda _: unit),
             "SAI?": lambda _: self.axes,
             "SVA": self._set_voltages,
             "SVA?": lambda given: self._tell(given, lambda axis: f"{self.voltage(axis) * self.units_per_volt:.6f}"),
             "SVO": self._set_servo,
             "SVO?": lambda given: self._tell(given, lambda axis: str(int(self.servo[axis]))),
             "TMN?": lambda given: self._tell(given, lambda _: "0.0000"),
-            "TMX?": lambda given: self._tell(given, lambda _: "25.0000"),
+            "TMX?": lambda given: self._tell(given, lambda _: f"{TRAVEL / self.metres:.6g}"),
             "VMA?": lambda given: self._tell_output(given, lambda _: f"{self.high:.4f}"),
             "VMI?": lambda given: self._tell_output(given, lambda _: f"{self.low:.4f}"),
             "VOL?": lambda given: self._tell_output(given, lambda axis: f"{self.voltage(axis):.6f}"),
@@ -138,7 +148,7 @@ class GcsSimulator(StreamSimulator):
     def _tell_positions(self, given: list[str]) -> list[str]:
         self.cycles += 1
         readings = self.measure()
-        return self._tell(given, lambda axis: f"{readings[axis] / MICROMETRE:.6f}")
+        return self._tell(given, lambda axis: f"{readings[axis] / self.metres:.6f}")
 
     def _set_voltages(self, given: list[str]) -> list[str]:
         wanted = dict(zip(given[::2], given[1::2], strict=False))

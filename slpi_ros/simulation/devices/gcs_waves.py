@@ -9,7 +9,6 @@ CYCLE = 5e-5
 WAVE_POINTS, RECORD_POINTS = 262_144, 32_768
 # Longest command, bytes.
 LONGEST = 8192
-MICROMETRE = 1e-6
 # The stage follows the outputs at this period, as it takes longer than a servo cycle to compute; between, its recorded
 # position is interpolated.
 STAGE_NS = 1_000_000
@@ -91,7 +90,7 @@ class SimulatedWaves:
         for table, (axis, what) in recorder.sources.items():
             row = recorder.rows.setdefault(table, [])
             if what == 2:
-                begin, end = recorder.told.get(axis, told[axis]) / MICROMETRE, told[axis] / MICROMETRE
+                begin, end = (at[axis] / self._device.metres for at in ({**told, **recorder.told}, told))
                 row += [begin + (end - begin) * (n + 1) / count for n in chosen]
             else:
                 row += [playing[axis][n] if axis in playing else before[axis] for n in chosen]

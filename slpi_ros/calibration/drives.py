@@ -212,13 +212,14 @@ def _sweep_seconds(settings: CalibrationSettings) -> float:
 def _quickest(limits: Limits, span: float) -> float:
     """Return the shortest duration (s) of a raised cosine over a `span` of the voltage range (share)."""
     way = span * (limits.upper - limits.lower)
-    by_slew = math.pi / 2 * way / (SLEW_USED * limits.slew)
+    by_slew = math.pi / 2 * way / min(SLEW_USED * limits.slew, limits.mean_rate)
     return max(by_slew, math.pi * math.sqrt(way / (2 * SLEW_USED * limits.acceleration)))
 
 
 def _slew(limits: Limits) -> float:
-    """Return the slew rate (V/s) for a drive; 0: no limit."""
-    return SLEW_USED * limits.slew if np.isfinite(limits.slew) else 0.0
+    """Return the slew rate (V/s) for a drive, which is not faster than its mean may be; 0: no limit."""
+    slew = min(SLEW_USED * limits.slew, limits.mean_rate)
+    return slew if np.isfinite(slew) else 0.0
 
 
 def _spec(limits: Limits, duration: float, rate: float) -> DriveSpec:

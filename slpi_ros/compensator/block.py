@@ -2,7 +2,8 @@
 
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from math import inf
 
 import numpy as np
 
@@ -10,7 +11,7 @@ from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.compensator import validation as rejection
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.monitor import Finding, Rule, Silence
-from slpi_ros.compensator.trajectory import Trajectory
+from slpi_ros.compensator.trajectory import Trajectory, require_mean_rate
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import RateLimiter
@@ -95,7 +96,10 @@ def plan(path: Trajectory, axes: Sequence[Axis], stage: StageStream | None, peri
         # What the limits held back at the end.
         while behind and len(rows) <= 2 * LONGEST:
             behind = step(listed[-1])
-    return Block(stamp_ns, names, period, np.array(rows), lead_in, missed)
+    voltages = np.array(rows)
+    for axis, v in zip(moved, voltages.T, strict=True):
+        require_mean_rate(axis.name, np.arange(v.size) * period, v, axis.output.limits.mean_rate)
+    return Block(stamp_ns, names, period, voltages, lead_in, missed)
 
 
 @contextmanager
@@ -104,7 +108,8 @@ def _tried(axes: Sequence[Axis], period: float) -> Iterator[None]:
     saved = [(axis.stream, axis.stream.snapshot(), axis.stream.pace, axis.stream.coupled) for axis in axes]
     try:
         for axis in axes:
-            axis.stream.pace = RateLimiter(axis.output.limits, period, axis.voltage)
+            # The mean rate is judged of the whole block.
+            axis.stream.pace = RateLimiter(replace(axis.output.limits, mean_rate=inf), period, axis.voltage)
             axis.stream.pace.begin(0)
         yield
     finally:

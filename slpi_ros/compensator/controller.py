@@ -4,9 +4,12 @@ from array import array
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from enum import Enum
+from math import inf
 
+import numpy as np
 from numpy.typing import ArrayLike
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.compensator import validation as rejection
 from slpi_ros.compensator.amplifier import STEADY_NS
 from slpi_ros.compensator.axis import Axis
@@ -31,7 +34,7 @@ from slpi_ros.compensator.persistence import RESETTING, SENSOR, MemoryConfidence
 from slpi_ros.compensator.reporters import WhoseStage
 from slpi_ros.compensator.statistics import Counts
 from slpi_ros.compensator.surroundings import Surroundings
-from slpi_ros.compensator.trajectory import Trajectory, TrajectoryExecutor
+from slpi_ros.compensator.trajectory import Trajectory, TrajectoryExecutor, require_mean_rate
 from slpi_ros.compensator.validation import RejectedError, TimestampRules
 from slpi_ros.compensator.watchdog import CommandWatchdog
 from slpi_ros.errors import SlpiError, UsageError
@@ -417,6 +420,7 @@ class Controller:
             return
         try:
             path = self._path(Kind.TRAJECTORY, names, time_from_start_ns, positions, start_ns, now_ns)
+            self._require_mean_rates(path)
             delays = {axis.name: axis.model.chain.delay for axis in self.axes if axis.model}
             self.trajectory.start(path, clock_ns, delays, {axis.name: axis.stream for axis in self.axes})
         except RejectedError:
@@ -424,6 +428,8 @@ class Controller:
             raise
         self._clock_ahead_ns = clock_ns - now_ns
         self.watchdog.feed(now_ns)
+        for axis in self.axes:
+            axis.output.checked = True
 
     def follow_block(
         self,
@@ -466,6 +472,15 @@ class Controller:
         self.ownership.begin_output(now_ns)
         return path
 
+    def _require_mean_rates(self, path: Trajectory) -> None:
+        """Reject a path whose voltages have too high a mean rate, as the models of its axes tell."""
+        t: FloatArray = path.time_from_start_ns.astype(np.float64) * 1e-9
+        for axis in self.axes:
+            if axis.name in path.names and axis.model and axis.output.limits.mean_rate < inf:
+                within = Limits(axis.stream.limits.lower, axis.stream.limits.upper)
+                v, _ = axis.model.compensate(t, path.positions[:, path.names.index(axis.name)], within)
+                require_mean_rate(axis.name, t, v, axis.output.limits.mean_rate)
+
     def hear_block(self, stamp_ns: int, state: str, sample: int, reason: str, now_ns: int) -> bool:
         """Take what a driver tells of a block; return whether the present one has ended with it."""
         block = self.block
@@ -498,6 +513,7 @@ class Controller:
         if not self.trajectory.on:
             for axis in self.axes:
                 axis.samples.restart()
+                axis.output.checked = False
         return True
 
     # Motion without desired displacements
@@ -553,6 +569,7 @@ class Controller:
         if reason is not StopReason.SILENCE:
             self.watchdog.feed(now_ns)
         for axis in self.axes:
+            axis.output.checked = False
             if reason is StopReason.LOST:
                 axis.begin(Fault(), now_ns)
                 continue

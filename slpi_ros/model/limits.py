@@ -7,6 +7,7 @@ from math import inf, sqrt
 
 from slpi_ros.effects.excitation import MEAN_SPEED
 from slpi_ros.errors import UsageError
+from slpi_ros.model.mean_rate import Travelled
 
 # Longest time between two samples that counts for effects and for the rate of a path, seconds.
 MAX_DT = 0.1
@@ -22,12 +23,14 @@ class Limits:
     upper: float  # V
     slew: float = inf  # V/s; inf: no limit
     acceleration: float = inf  # V/s^2; inf: no limit
+    mean_rate: float = inf  # V/s, mean of |dV/dt| over 10 s; inf: no limit
 
     def __post_init__(self) -> None:
-        if not self.lower <= self.upper or not self.slew > 0 or not self.acceleration > 0:
+        if not self.lower <= self.upper or not min(self.slew, self.acceleration, self.mean_rate) > 0:
             raise UsageError(
-                f"voltage limits {self.lower:g}..{self.upper:g} V with slew {self.slew:g} V/s and acceleration "
-                f"{self.acceleration:g} V/s^2 are not valid; give lower <= upper, and positive slew and acceleration"
+                f"voltage limits {self.lower:g}..{self.upper:g} V with slew {self.slew:g} V/s, acceleration "
+                f"{self.acceleration:g} V/s^2 and mean rate {self.mean_rate:g} V/s are not valid; give lower <= upper, "
+                "and positive rates"
             )
 
     @property
@@ -62,11 +65,15 @@ class RateLimiter:
     # periods count: a late step is made up, a pause is not. With an acceleration limit every step leaves enough
     # distance to stop at the voltage limits and at the goal; a step after a pause starts from rest and counts one
     # output period. `voltage` (V) is the last output, or found at the amplifier, `rate` (V/s) that of the last step,
-    # `period` in seconds.
-    __slots__ = ("_changed_ns", "_goal", "_limits", "_pending", "period", "rate", "voltage")
+    # `period` in seconds, `fastest` (V/s) what the slew limit and the mean rate allowed last. The slew limit
+    # falls before the mean rate is reached, but not of a path that is known to keep it (`checked`).
+    __slots__ = (
+        "_changed_ns", "_goal", "_limits", "_pending", "_travelled", "checked", "fastest", "period", "rate", "voltage",
+    )  # fmt: skip
 
     def __init__(self, limits: Limits, period: float = PERIOD, voltage: float = 0.0) -> None:
-        self._limits, self.period = limits, period
+        self._limits, self.period, self.fastest = limits, period, limits.slew
+        self._travelled, self.checked = Travelled(), False
         self._pending: tuple[Limits, float] | None = None
         self.start(voltage)
 
@@ -122,6 +129,11 @@ class RateLimiter:
         limits, present = self._limits, self.voltage
         lower, upper = limits.lower, limits.upper
         fastest = min(limits.slew, fastest)
+        if limits.mean_rate < inf:
+            allowed = self._travelled.left(limits.mean_rate, now_ns) / (2.0 * self.period)
+            if not self.checked:
+                allowed = min(allowed, self._travelled.fastest(limits.mean_rate, now_ns))
+            self.fastest = fastest = min(fastest, allowed)
         if limits.acceleration < inf:
             down, up = self._ways(now_ns, fastest)
         elif fastest < inf:
@@ -169,7 +181,9 @@ class RateLimiter:
 
     def copy(self) -> "RateLimiter":
         """Return an independent copy."""
-        return copy(self)
+        other = copy(self)
+        other._travelled = self._travelled.copy()
+        return other
 
     def _moved(self, v: float, now_ns: int, goal: float) -> None:
         if not self._recent(now_ns):
@@ -180,6 +194,8 @@ class RateLimiter:
                 self.rate, self._changed_ns = (v - self.voltage) / dt, now_ns
             elif self._changed_ns is None or now_ns > self._changed_ns:
                 self._changed_ns = now_ns
+            if self._limits.mean_rate < inf:
+                self._travelled.move(abs(v - self.voltage), now_ns)
             self.voltage = v
         self._goal = goal
         if self._pending is not None and not self.in_motion:
@@ -220,11 +236,13 @@ class RateLimiter:
 
 
 class StageLimiter:
-    """Voltages of all axes at the output, each by its own `RateLimiter`; `voltages` (V) are the last ones."""
+    """Voltages of the axes of a checked drive, each by its own `RateLimiter`; `voltages` (V) are the last ones."""
 
     def __init__(self, limits: Sequence[Limits], period: float) -> None:
         self._limits = tuple(limits)
         self._each = [RateLimiter(one, period) for one in limits]
+        for each in self._each:
+            each.checked = True
 
     @property
     def voltages(self) -> tuple[float, ...]:

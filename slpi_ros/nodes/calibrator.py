@@ -34,6 +34,7 @@ DECLARATIONS = declare.read_only(
     declare.AXES,
     *declare.voltage_limits(", of which drives use 80 %"),
     declare.ACCELERATION_LIMIT,
+    declare.MEAN_RATE_LIMIT,
     declare.each_axis(
         "rest_voltage", math.nan, "Voltage before and after every drive, volts; NaN: 0 V, or the limit next to it.",
         declare.VOLTAGE,

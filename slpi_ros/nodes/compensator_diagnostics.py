@@ -348,6 +348,10 @@ def _axis_problems(axis: Axis, factor: float, moving: bool, since_busy: float) -
             "the sensor, then set feedback to true again"
         )
         yield Problem("sensor", ERROR, fault)
+    limits = axis.output.limits
+    if axis.output.fastest < limits.slew and limits.mean_rate < math.inf:
+        slowed = f"{axis.output.fastest:.4g} V/s at most, so that the mean stays within mean_rate_limit"
+        yield Problem("mean rate", WARN, f": {slowed} {limits.mean_rate:g} V/s; send slower paths")
     if axis.amplifier.silent:
         yield Problem("", WARN, ": stage_state no longer reports its voltage (effort)")
     if moving and loop.state == "saturated":

@@ -44,6 +44,7 @@ DECLARATIONS = (
     # Limits
     *declare.voltage_limits(low=0.0, high=100.0),
     declare.ACCELERATION_LIMIT,
+    declare.MEAN_RATE_LIMIT,
     declare.scalar(
         "output_rate", 1000.0,
         "Voltages per second while a trajectory, a ramp, a hold or what the limits held back is output, hertz. In one "

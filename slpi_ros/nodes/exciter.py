@@ -14,6 +14,7 @@ from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.excitation.drives import DRIVES, SLEW_USED, Drive, Playback, excite
 from slpi_ros.io.messages import SECOND_NS, encode_trajectory
 from slpi_ros.model.limits import Limits, volts
+from slpi_ros.model.mean_rate import WINDOW, highest_mean_rate, slower_by
 from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.common import COMMANDS, request_stop, serve, steady_timer
 from slpi_ros.nodes.guarded_drive import GuardedDrive
@@ -24,6 +25,7 @@ LIVE = "live"
 DECLARATIONS = (
     declare.AXES,
     *declare.voltage_limits(", of which the drive uses 80 %"),
+    declare.MEAN_RATE_LIMIT,
     declare.each_axis(
         "rest_voltage", math.nan,
         "Voltage before and after the excitation, volts; NaN: as reported by stage_state. Without a publisher of "
@@ -71,7 +73,21 @@ class ExciterSettings:
         rest = self.values["rest_voltage"] or [limits.clip(v) for limits, v in zip(self.limits, found, strict=True)]
         same = ("axes", "voltage_min", "voltage_max", "duration", "rate", "seed", "drive")
         slew_limit = [SLEW_USED * each.slew if each.slew < math.inf else 0.0 for each in self.limits]
-        return excite(slew_limit=slew_limit, start=rest, **{name: self.values[name] for name in same})
+        drive = excite(slew_limit=slew_limit, start=rest, **{name: self.values[name] for name in same})
+        self._require_mean_rate(drive)
+        return drive
+
+    def _require_mean_rate(self, drive: Drive) -> None:
+        """Raise UsageError if the mean rate of an axis exceeds its limit."""
+        again = 1 + math.ceil(WINDOW / drive.t[-1]) if self.values["repeat"] else 1
+        t = np.concatenate([drive.t + number * drive.t[-1] for number in range(again)])
+        for (axis, v), limits in zip(drive.voltage.items(), self.limits, strict=True):
+            if (slower := slower_by(t, np.tile(v, again), limits.mean_rate)) > 1.0:
+                raise UsageError(
+                    f"axis '{axis}': the drive has a mean rate of {highest_mean_rate(t, np.tile(v, again)):.4g} V/s "
+                    f"over {WINDOW:g} s, mean_rate_limit is {limits.mean_rate:g} V/s; make it {slower:.3g} times "
+                    f"slower: slew_limit {limits.slew / slower:.4g} and duration {self.values['duration'] * slower:.4g}"
+                )
 
 
 # Period of the watch and of messages while it waits, seconds.

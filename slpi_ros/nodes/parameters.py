@@ -122,6 +122,12 @@ AXES = Declaration("axes", ["x"], "Names of the axes, in the order of voltage_co
 ACCELERATION_LIMIT = each_axis(
     "acceleration_limit", 0.0, "Maximum change of the rate of a voltage, V/s^2; 0: no limit.", (0.0, 1e12)
 )
+MEAN_RATE_LIMIT = each_axis(
+    "mean_rate_limit", 0.0,
+    "Largest mean of |dV/dt| over 10 s, up and down both counted, V/s: twice the average current of a data sheet over "
+    "the capacitance. 0: no limit.",
+    (0.0, 1e9),
+)  # fmt: skip
 STATE_TIMEOUT = scalar(
     "state_timeout", 0.5,
     "Seconds without a valid stage_state after which a drive is given up; reports of the voltage may be as late.",
@@ -161,10 +167,11 @@ def limits_of(values: Values) -> tuple[Limits, ...]:
                 "correct one of the two"
             )
     slews = slew_limits(values["slew_limit"], lows, highs)
-    accelerations = values.get("acceleration_limit", [0.0] * len(lows))
+    none = [0.0] * len(lows)
+    accelerations, means = values.get("acceleration_limit", none), values.get("mean_rate_limit", none)
     return tuple(
-        Limits(low, high, slew or math.inf, acceleration or math.inf)
-        for low, high, slew, acceleration in zip(lows, highs, slews, accelerations, strict=True)
+        Limits(low, high, *(each or math.inf for each in rates))
+        for low, high, *rates in zip(lows, highs, slews, accelerations, means, strict=True)
     )
 
 

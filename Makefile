@@ -40,7 +40,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test test-long test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-export bench-coverage test-export-arm FORCE
+.PHONY: help build test test-long test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-oscillation bench-export bench-coverage test-export-arm FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -74,6 +74,7 @@ help:
 	@echo 'make audit      known vulnerabilities of the pinned dependencies, by pip-audit'
 	@echo 'make bench-learning  paths that repeat on stages of other physics, beside feedback and another learning; 20 minutes; LEARNING="--count 40 --all-paths"'
 	@echo 'make bench-loop-rate  crossover of the closed loop with 10, 100 and 1,000 commands a second, a minute'
+	@echo 'make bench-oscillation  feedback that oscillates and feedback that is well tuned: what is switched off, and when; six minutes'
 	@echo 'make bench-lies     eight kinds of sensors that lie, and honest ones: time driven, false alarms; ten minutes'
 	@echo 'make bench-rate-law  the rate law: round trips, cost, and what it predicts of measured records, 15 minutes'
 	@echo 'make bench-foreign   stages whose physics is not that of the package: PI, SLPI, SLPI with causes; 15 minutes'
@@ -163,6 +164,9 @@ bench-latency: build
 
 bench-loop-rate: build
 	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/loop_rate.py
+
+bench-oscillation: build
+	OPENBLAS_NUM_THREADS=1 $(VENV) -m benchmarks.oscillation
 
 bench-learning: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/learning.py $(LEARNING)

@@ -25,6 +25,12 @@ CONSTANT, NO_CONSTANT = 0.9, 0.3
 LATE = 0.01
 # Shortest time between two log messages of what is counted, seconds; other problems are logged each time they appear.
 LOG_PERIOD = 5.0
+# What of the feedback a rule finds faulty, and what to do.
+FAULTS = {
+    "sensor": ("the sensor", "repair the sensor, then set feedback to true again"),
+    "oscillation": ("the loop", "set lower gains (docs, feedback gains), or feedback to true again"),
+    "loop": ("the loop", "set these gains"),
+}
 COUNTED_KINDS = ("messages", "trajectories", "measurements", "held", "late")
 
 
@@ -334,11 +340,9 @@ def _axis_problems(axis: Axis, factor: float, moving: bool) -> Iterator[Problem]
     if moving and loop.state == "holding":
         yield Problem("", WARN, ": feedback holds, measurement too old")
     if loop.fault:
-        fault = (
-            f": feedback is off, the sensor is {loop.fault.kind}: {loop.fault.reason}; the model goes on alone; repair "
-            "the sensor, then set feedback to true again"
-        )
-        yield Problem("sensor", ERROR, fault)
+        subject, remedy_of = FAULTS[loop.fault.rule]
+        fault = f"{subject} is {loop.fault.kind}: {loop.fault.reason}; the model goes on alone; {remedy_of}"
+        yield Problem(loop.fault.rule, ERROR, f": feedback is off, {fault}")
     if axis.amplifier.silent:
         yield Problem("", WARN, ": stage_state no longer reports its voltage (effort)")
     if moving and loop.state == "saturated":

@@ -24,6 +24,7 @@ from slpi_ros.compensator.samples import SOONEST_HOLD_NS, Samples
 from slpi_ros.compensator.statistics import TrackingStatistics
 from slpi_ros.compensator.uncertainty import Uncertainty
 from slpi_ros.compensator.validation import implausible
+from slpi_ros.errors import UsageError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.axis_model import AxisModel, StartMemory
 from slpi_ros.model.limits import PERIOD, Limits, RateLimiter, volts
@@ -163,6 +164,11 @@ class Axis:
             self.stream.pace.change(allowed, period)
         self.output.change(allowed, period)
         self.motion.wake()
+
+    def check_loop(self, settings: LoopSettings, period: float) -> None:
+        """Raise UsageError if other feedback settings or another output period (s) make the model's loop unstable."""
+        if reason := self.loop.refusal(settings, period):
+            raise UsageError(f"axis '{self.name}': {reason}")
 
     def retune(self, settings: LoopSettings) -> None:
         """Replace the feedback settings without a voltage step; feedback that was switched off for a fault resumes."""

@@ -112,7 +112,8 @@ class Controller:
         self.trajectory = TrajectoryExecutor(period, lambda name: by_name[name].setpoint)
         self.watchdog = CommandWatchdog()
         # What it finds is answered by `watch`; what is reported of the amplifiers, by `report` at once.
-        self.monitor = Monitor(self.watchdog, *(axis.loop.sensor for axis in self.axes))
+        rules = [rule for axis in self.axes for rule in (axis.loop.sensor, axis.loop.oscillation)]
+        self.monitor = Monitor(self.watchdog, *rules)
         self.block: BlockFollower | None = None  # the last one
         self.stopped: StopReason | None = None  # why all motion was ended last
         self._lifecycle = OperatingMode.UNCONFIGURED
@@ -601,18 +602,20 @@ class Controller:
         """Return what the monitor newly finds, after the answer to it.
 
         Commands that stop: the voltages are held, or go to the safe ones. A sensor that is faulty for `fault_time` (s;
-        0: never): its feedback is switched off. A block of which nothing is heard: it is given up.
+        0: never), or an oscillation that feedback sustains: its feedback is switched off. A block of which nothing is
+        heard: it is given up.
         """
         # A trajectory counts as a command until its last point. The watchdog is suspended during a reset of the memory.
         waiting = self.mode in (OperatingMode.STREAMING, OperatingMode.RAMPING)
         self.watchdog.timeout = safety.command_timeout if waiting else 0.0
         for axis in self.axes:
-            judged = self.ownership.owned and axis.loop.active and not (axis.loop.fault or axis.motion.drives)
-            axis.loop.sensor.fault_time = fault_time if judged else 0.0
+            axis.loop.judge(fault_time, self.ownership.owned and not axis.motion.drives, now_ns)
         news = self.monitor.check(now_ns)
         for found in news:
-            if found.rule == "sensor":
+            if found.rule in ("sensor", "oscillation"):
                 self.messages.by_name[found.axis].loop.switch_off(found)
+        for axis in self.axes:
+            axis.loop.listen()
         if self.watchdog.react(safety):
             if self.watchdog.safe_voltages and self.ownership.owned:
                 self.stopped = StopReason.SILENCE

@@ -237,3 +237,4 @@ class LoopSettings:
     gains: PidGains
     timeout: float  # s, the age from which measurements are ignored
     correction_limit: float = inf  # V
+    forced: bool = False  # whether gains are taken with which the loop of the model is not stable enough

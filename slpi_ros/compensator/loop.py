@@ -1,12 +1,16 @@
 """Sensor and feedback of one axis: readings correct its voltage, and are held against its model."""
 
 from collections import deque
+from collections.abc import Callable
+from functools import lru_cache, partial
 from math import isfinite
 from statistics import median
 
-from slpi_ros.compensator.feedback import Drift, Feedback, LoopSettings, ResidualWindow
+from slpi_ros.compensator import loop_margin
+from slpi_ros.compensator.feedback import Drift, Feedback, LoopSettings, PidGains, ResidualWindow
 from slpi_ros.compensator.model_swap import continue_from
 from slpi_ros.compensator.monitor import Finding
+from slpi_ros.compensator.oscillation_rule import OscillationRule
 from slpi_ros.compensator.sensor_rule import SensorRule
 from slpi_ros.compensator.statistics import TrackingStatistics
 from slpi_ros.errors import SlpiError
@@ -18,6 +22,8 @@ from slpi_ros.model.streaming import StreamingInverse
 
 # Most measurements for the offset of an axis, and how old they may be.
 OFFSETS, OFFSET_AGE_NS = 50, SECOND_NS // 5
+# The kind of a fault: the loop of the model is not stable enough.
+UNSTABLE = "unstable"
 
 
 class Loop:
@@ -40,8 +46,12 @@ class Loop:
         self.settings, self._output = settings, output
         self.closed = False  # whether the total voltage is followed, because there was a reading
         self.active = False  # whether readings correct it
-        self.fault: Finding | None = None  # for which the feedback was switched off
+        self.fault: Finding | None = None  # for which the feedback is off
         self.sensor = SensorRule(1.0, axis=axis)  # whether its readings follow the model
+        self.oscillation = OscillationRule(1.0, axis=axis)  # whether feedback sustains one
+        self._held = False  # whether the correction is held, to listen to it
+        # Why gains are not used with the model at an output period (s); "": they are.
+        self._refusal: Callable[[PidGains, float], str] = lambda gains, period: ""
         # Measured - model, with the time (ns), also where the measurement is refused.
         self._offsets: deque[tuple[int, float]] = deque(maxlen=OFFSETS)
         # Setpoint and displacement of the model as a sensor with delay or lag reads them; None without these.
@@ -60,7 +70,7 @@ class Loop:
 
     @property
     def state(self) -> str:
-        """One of "off", "on", "saturated", "holding" (no recent measurement) or "fault" (of the sensor)."""
+        """One of "off", "on", "saturated", "holding" (no recent measurement) or "fault"."""
         if not self.settings.enabled:
             return "off"
         if self.fault:
@@ -88,21 +98,44 @@ class Loop:
     def use(self, model: AxisModel, allowed: Limits, stream: StreamingInverse, now_ns: int) -> None:
         """Follow another `model` with the inverse `stream` of the axis; the voltage is unchanged."""
         low, high = model.displacement_range
-        self.sensor.span, self.sensor.noise = high - low, model.quality.floor_rms
+        for rule in (self.sensor, self.oscillation):
+            rule.span, rule.noise = high - low, model.quality.floor_rms
+        self._refusal = lru_cache(maxsize=4)(partial(loop_margin.refusal, model))
         self._sensor = model.streaming_sensor()
         self._setpoint = Sensed(self._sensor, stream.uncoupled_displacement) if self._sensor.late else None
         if self.closed:
             self._applied = continue_from(model, allowed, self._applied)
             self._forget_residuals()
+            if self.fault is None or self.fault.kind == UNSTABLE:
+                self.fault = self._unstable()
+                self._feedback.switch(self.settings.enabled and not self.fault)
         elif self.settings.enabled:
+            self.fault = self._unstable()
             self.close(stream, now_ns)
+
+    def refusal(self, settings: LoopSettings, period: float) -> str:
+        """Return why settings are not used with the model at this output period (s), and which gain would; "": none."""
+        before = self.settings
+        anew = settings.enabled and not before.enabled
+        if (settings.gains, settings.forced, period) == (before.gains, before.forced, self._output.period) and not anew:
+            return ""
+        return "" if settings.forced else self._refusal(settings.gains, period)
+
+    def _unstable(self) -> Finding | None:
+        """Return what is wrong with the loop of the model, if that counts."""
+        settings = self.settings
+        counts = settings.enabled and not settings.forced
+        reason = self._refusal(settings.gains, self._output.period) if counts else ""
+        return Finding("loop", UNSTABLE, reason, self.sensor.axis) if reason else None
 
     def retune(self, settings: LoopSettings, stream: StreamingInverse | None, now_ns: int) -> None:
         """Replace the settings without a voltage step; feedback that was switched off for a fault resumes."""
         if self.fault:
             # What the sensor told before does not count any more.
             self.sensor.begin(now_ns)
-        self.settings, self.fault, self.active = settings, None, self.closed and settings.enabled
+        self.settings, self.active = settings, self.closed and settings.enabled
+        self.fault = self._unstable()
+        self.oscillation.begin(now_ns)
         if not self.closed:
             if settings.enabled and stream is not None:
                 self.close(stream, now_ns)
@@ -115,7 +148,7 @@ class Loop:
             # The last measurement gives no finite voltage with the new gains.
             feedback.forget()
             feedback.retune(settings.gains)
-        feedback.switch(settings.enabled)
+        feedback.switch(settings.enabled and not self.fault)
 
     def close(self, stream: StreamingInverse, now_ns: int) -> None:
         """Start to follow the total voltage, at present that of the inverse `stream` of the axis."""
@@ -130,6 +163,7 @@ class Loop:
         # The feedforward has a rate limiter of its own, beside that of the total voltage.
         stream.pace = self._output.copy()
         self.sensor.begin(now_ns)
+        self.oscillation.begin(now_ns)
         self.closed, self.active = True, settings.enabled
         self.driven_ns = self.due_ns = now_ns
         self._between = 0.0
@@ -176,12 +210,29 @@ class Loop:
         if desired is not None or not self._setpoint:
             if not self.fault:
                 self._feedback.measure(x, now_ns, desired)
+            if self.active:
+                aim = tracking.desired if desired is None else desired
+                if aim is not None:
+                    self.oscillation.take(x - aim, aim, now_ns)
             tracking.measure(x, desired)
 
     def switch_off(self, fault: Finding) -> None:
-        """Switch the feedback off because of a fault of its sensor."""
+        """Switch the feedback off because of a fault."""
         self.fault = fault
         self._feedback.switch(False)
+
+    def judge(self, fault_time: float, on: bool, now_ns: int) -> None:
+        """Let the rules judge sensor (for `fault_time`, s) and oscillation, if feedback is `on`."""
+        on = on and self.active and not self.fault
+        self.sensor.fault_time = fault_time if on else 0.0
+        self.oscillation.watch(on, now_ns)
+        self.sensor.excused = self.oscillation.noticed
+
+    def listen(self) -> None:
+        """Hold the correction while the rule of oscillations listens, and go on without a voltage step."""
+        if self._held and not self.oscillation.held:
+            self._feedback.forget()
+        self._held = self.oscillation.held
 
     def forget_offsets(self) -> None:
         """Forget the offsets: the zero has moved."""
@@ -209,7 +260,7 @@ class Loop:
         if dt > MAX_DT:
             applied.wait(dt - MAX_DT)
             dt = MAX_DT
-        v = self._feedback.step(y, v, now_ns, self.settings.timeout if first else None)
+        v = self._feedback.step(y, v, now_ns, self.settings.timeout if first and not self._held else None)
         self.driven_ns = now_ns
         # At the end of the period after this one; a voltage that moves within an acceleration limit goes on in each.
         self.due_ns = self._corrected_ns + 2 * period_ns

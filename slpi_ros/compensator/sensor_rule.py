@@ -77,6 +77,7 @@ class SensorRule(Rule):
     def __init__(self, span: float, noise: float = 0.0, limits: SensorLimits | None = None, axis: str = "") -> None:
         self.span, self.noise, self.axis = span, noise, axis
         self.fault_time = 0.0
+        self.excused = False  # whether the readings tell of an oscillation, which another rule judges
         self._limits = limits or SensorLimits()
         self._readings: deque[tuple[int, float, float]] = deque(maxlen=KEPT)  # ns, expected (m), reading (m)
         self._silence: Silence | None = None  # None: not begun
@@ -100,7 +101,7 @@ class SensorRule(Rule):
             return None
         if reason := self._silence.beyond(self.fault_time, now_ns):
             return Finding("sensor", "silent", reason, self.axis)
-        kind, reason = self._look(now_ns)
+        kind, reason = ("", "") if self.excused else self._look(now_ns)
         lasts = self._suspect.note(kind, now_ns, int(self._limits.lasts * self.fault_time * SECOND_NS))
         return Finding("sensor", kind, reason, self.axis) if lasts else None
 

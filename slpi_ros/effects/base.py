@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.arrays.rates import fastest
 from slpi_ros.effects.excitation import Excitation
-from slpi_ros.effects.filters import Uniform
+from slpi_ros.effects.filters import AT_ONCE, Dynamics, Uniform
 from slpi_ros.effects.parameters import Leaf, facts_of, leaves, require_facts, with_leaves
 from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.io.record import Course
@@ -404,6 +404,16 @@ class EffectBase(Protocol):
     def settling_time(self) -> float:
         """Time (s) after which the piezo has the voltage of the command."""
         return abs(self.shift)
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """Its linear dynamics, without a transport delay, as a fast closed loop sees them; of most effects none."""
+        return AT_ONCE
+
+    @property
+    def steepest(self) -> float:
+        """Largest factor by which it multiplies the slope of the displacement."""
+        return 1.0
 
     @property
     def unsure(self) -> Unsure:

@@ -91,6 +91,11 @@ class Contact(EffectBase):
     def _at(cls, position: float, gains: FloatArray) -> "Contact":
         return cls(position, max(1.0 + float(gains[0]), LEAST_GAIN))
 
+    @property
+    def steepest(self) -> float:
+        """The larger one of both slopes."""
+        return max(self.gain, 1.0)
+
     def describe(self) -> str:
         """Describe the position and the slope."""
         way = f"{self.gain:.3g} times the slope before"

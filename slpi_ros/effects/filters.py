@@ -36,6 +36,36 @@ class Hold(NamedTuple):
     kept: float
 
 
+class Dynamics(NamedTuple):
+    """Linear dynamics of n states with static gain 1: ``dx/dt = a x + b u``, ``y = c x + d u``."""
+
+    a: FloatArray  # (n, n), 1/s
+    b: FloatArray  # (n,), 1/s
+    c: FloatArray  # (n,)
+    d: float
+
+    def then(self, other: "Dynamics") -> "Dynamics":
+        """Return these dynamics followed by others."""
+        across = np.outer(other.b, self.c)
+        a = np.block([[self.a, np.zeros_like(across.T)], [across, other.a]])
+        return Dynamics(
+            a,
+            np.concatenate([self.b, other.b * self.d]),
+            np.concatenate([other.d * self.c, other.c]),
+            self.d * other.d,
+        )
+
+
+# What follows at once.
+AT_ONCE = Dynamics(np.empty((0, 0)), np.empty(0), np.empty(0), 1.0)
+
+
+def first_order(time_constant: float) -> Dynamics:
+    """Return the dynamics of a first-order lag (s)."""
+    rate = 1.0 / time_constant
+    return Dynamics(np.array([[-rate]]), np.array([rate]), np.ones(1), 0.0)
+
+
 def hold(dt: float, time_constant: float) -> Hold:
     """Return the coefficients of a first-order lag over `dt` (s); for ``dt = 0`` the output is unchanged."""
     x = dt / time_constant
@@ -92,6 +122,12 @@ class Mode:
         """Return the frequency response, shape (K,), at frequencies (Hz, (K,))."""
         ratio = frequency / self.frequency
         return np.asarray(1.0 / (1.0 - ratio**2 + 2j * self.damping * ratio))
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """The mode with all of the motion; states: position, and velocity over ``w``."""
+        w = self.omega
+        return Dynamics(w * np.array([[0, 1], [-1, -2 * self.damping]]), np.array([0, w]), np.array([1.0, 0]), 0.0)
 
     def release(self, t: FloatArray) -> FloatArray:
         """Return the position, shape (N,), at times `t` (s) after a release from 1 at rest, with input 0."""

@@ -23,7 +23,7 @@ from slpi_ros.effects.base import (
 )
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, at_speeds
-from slpi_ros.effects.filters import DAMPING, Hold, filtered, hold
+from slpi_ros.effects.filters import DAMPING, Dynamics, Hold, filtered, first_order, hold
 from slpi_ros.effects.parameters import Fit, in_samples, parameter
 
 # Number of time constants after which the piezo has the voltage of the command.
@@ -90,6 +90,11 @@ class Lag(EffectBase):
     def settling_time(self) -> float:
         """Time (s) after which the piezo has the voltage of the command."""
         return SETTLED * self.time_constant
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """The lag."""
+        return first_order(self.time_constant)
 
     def describe(self) -> str:
         """Describe the time constant."""

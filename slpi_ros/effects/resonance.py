@@ -26,7 +26,16 @@ from slpi_ros.effects.base import (
     usual_step,
 )
 from slpi_ros.effects.excitation import FEWEST_STEPS, DriveLimits, DrivePath, Excitation, loops, move, remaining
-from slpi_ros.effects.filters import LEAST_GAIN, SPACING, WIDEST, Mode, StreamingMode, filtered, mode_poles
+from slpi_ros.effects.filters import (
+    LEAST_GAIN,
+    SPACING,
+    WIDEST,
+    Dynamics,
+    Mode,
+    StreamingMode,
+    filtered,
+    mode_poles,
+)
 from slpi_ros.effects.parameters import as_list, parameter, require
 
 # A zero is near a mode up to this ratio of the squared frequencies, which is the largest gain of `Exact`.
@@ -331,6 +340,16 @@ class Resonance(EffectBase):
     @classmethod
     def _if_seen(cls, mode: Mode, gains: FloatArray) -> "Resonance | None":
         return cls((replace(mode, gain=min(float(gains[0]), 1.0)),)) if gains[0] >= LEAST_GAIN else None
+
+    @property
+    def dynamics(self) -> Dynamics:
+        """The modes beside each other, and what follows at once."""
+        each = [mode.dynamics for mode in self.modes]
+        a = np.zeros((2 * len(each), 2 * len(each)))
+        for k, mode in enumerate(each):
+            a[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = mode.a
+        gains = np.repeat([mode.gain for mode in self.modes], 2)
+        return Dynamics(a, np.concatenate([m.b for m in each]), gains * np.concatenate([m.c for m in each]), self.rest)
 
     def describe(self) -> str:
         """Describe frequency, damping and share of each mode."""

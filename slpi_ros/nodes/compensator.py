@@ -126,6 +126,8 @@ class Compensator(LifecycleNode):
     def _check_settings(self, new: CompensatorSettings) -> None:
         for axis, limits in zip(self._controller.axes, new.limits, strict=True):
             axis.check_limits(limits)
+        for axis, loop in zip(self._controller.axes, new.loops, strict=True):
+            axis.check_loop(loop, new.period)
 
     def _use_settings(self, new: CompensatorSettings) -> None:
         self._controller.use_limits(new.limits, time.monotonic_ns(), new.period)

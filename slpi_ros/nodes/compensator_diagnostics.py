@@ -26,6 +26,12 @@ CONSTANT, NO_CONSTANT = 0.9, 0.3
 LATE = 0.01
 # Shortest time between two log messages of what is counted, seconds; other problems are logged each time they appear.
 LOG_PERIOD = 5.0
+# What of the feedback a rule finds faulty, and what to do.
+FAULTS = {
+    "sensor": ("the sensor", "repair the sensor, then set feedback to true again"),
+    "oscillation": ("the loop", "set lower gains (docs, feedback gains), or feedback to true again"),
+    "loop": ("the loop", "set these gains"),
+}
 COUNTED_KINDS = ("messages", "trajectories", "measurements", "held", "late")
 
 
@@ -343,11 +349,9 @@ def _axis_problems(axis: Axis, factor: float, moving: bool, since_busy: float) -
     if moving and loop.state == "holding":
         yield Problem("", WARN, ": feedback holds, measurement too old")
     if loop.fault:
-        fault = (
-            f": feedback is off, the sensor is {loop.fault.kind}: {loop.fault.reason}; the model goes on alone; repair "
-            "the sensor, then set feedback to true again"
-        )
-        yield Problem("sensor", ERROR, fault)
+        subject, remedy_of = FAULTS[loop.fault.rule]
+        fault = f"{subject} is {loop.fault.kind}: {loop.fault.reason}; the model goes on alone; {remedy_of}"
+        yield Problem(loop.fault.rule, ERROR, f": feedback is off, {fault}")
     limits = axis.output.limits
     if axis.output.fastest < limits.slew and limits.mean_rate < math.inf:
         slowed = f"{axis.output.fastest:.4g} V/s at most, so that the mean stays within mean_rate_limit"

@@ -141,6 +141,11 @@ DECLARATIONS = (
     declare.each_axis(
         "derivative_filter", 0.0, "Time constant of the derivative low-pass, seconds; 0: none.", (0.0, 1e3)
     ),
+    Declaration(
+        "force_gains", False,
+        "Whether gains are taken with which the loop of the model is unstable or hardly stable (modulus margin below "
+        "0.3); else feedback stays off with them.",
+    ),
     declare.each_axis(
         "correction_limit", nan,
         "Largest voltage that the feedback adds or subtracts, volts; NaN: a fifth of the voltage range.",
@@ -234,7 +239,7 @@ class CompensatorSettings:
                 values["ramp_rate"],
             ),
             tuple(
-                LoopSettings(values["feedback"], PidGains(*each), timeout, most)
+                LoopSettings(values["feedback"], PidGains(*each), timeout, most, values["force_gains"])
                 for each, most in zip(gains, corrections, strict=True)
             ),
         )

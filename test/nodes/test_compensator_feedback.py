@@ -116,6 +116,24 @@ def test_without_measurements_the_feedback_holds_and_says_so(x_file):
         )
 
 
+def test_gains_with_which_the_loop_of_the_model_is_unstable_never_come_on_unless_forced(x_file):
+    wild = 1e4 * GAINS["ki"]
+    with compensator(model_file=x_file, feedback=True, feedback_fault_time=0, ki=wild) as client:
+        client.connect()
+        stage = DriftedStage(client, 2.0)
+        stage.follow([5e-6] * 50)
+        values = client.report(**{"x.feedback": "fault", "x.feedback_fault": "unstable"})[1]
+        assert float(values["x.correction_V"]) == 0.0
+        refused = client.graph.set_parameters(client.name, ki=2.0 * wild)
+        assert "unstable" in refused and "\n" not in refused
+        would = float(refused.split("ki ")[1].split()[0])
+        assert client.graph.set_parameters(client.name, ki=would) == ""
+        client.report(**{"x.feedback_fault": ""})
+        assert "would do" in client.graph.set_parameters(client.name, feedback=False, ki=wild)
+        assert client.graph.set_parameters(client.name, feedback=False, ki=wild, force_gains=True) == ""
+        assert "would do" in client.graph.set_parameters(client.name, force_gains=False)
+
+
 def test_a_measurement_that_cannot_be_is_told_and_moves_nothing(x_file):
     """A wrong unit, and a sensor that fails: whatever comes between the good ones."""
     with compensator(model_file=x_file, feedback=True, feedback_fault_time=0, **GAINS) as client:

@@ -18,8 +18,8 @@ SHORTEST, LONGEST, QUIETEST = 100e-9, 2e-3, 1e-12
 ROUNDING = 1e-6
 # Cells of the voltage range; a displacement may belong to any voltage of this time before it.
 CELLS, LAG_NS = 64, 3 * SECOND_NS // 10
-# Readings that are taken: at most one in this time; those of which the noise is told.
-PERIOD_NS, KEPT = SECOND_NS // 200, 64
+# Time between two judgements. Readings that are taken: at most one in this time; those of which the noise is told.
+JUDGED_NS, PERIOD_NS, KEPT = SECOND_NS // 2, SECOND_NS // 50, 64
 # Lower quartile of the absolute value of a normal value, in standard deviations: the stage may move most of the time.
 QUARTILE = 0.3186
 
@@ -89,11 +89,13 @@ class PlausibleRule(Rule):
         self._cells: deque[tuple[int, int]] = deque()  # ns, cells of the last reports
         self._recent: deque[float] = deque(maxlen=KEPT)
         self._digit, self._last, self._taken_ns = np.inf, nan, -PERIOD_NS
+        self._judged_ns = -JUDGED_NS
         self._found = implausible_stroke(travel)
 
     def check(self, now_ns: int) -> Finding | None:
         """Return what is implausible."""
-        if not self._found:
+        if not self._found and now_ns - self._judged_ns >= JUDGED_NS:
+            self._judged_ns = now_ns
             told = len(self._recent) == KEPT
             self._found = self._stroke() or (implausible_noise(np.array(self._recent)) if told else "")
         return Finding("units", "implausible", self._found, self.axis) if self._found else None

@@ -323,8 +323,8 @@ SERIALS = "E-727.SIMULATED, serial number {}"
     [
         ({"hardware_id": "P-611"}, {"hardware_id": "P-611"}),
         ({}, {}),
-        ({"hardware_id": SERIALS.format(7)}, {}),
-        ({"hardware_id": "world"}, {}),
+        pytest.param({"hardware_id": SERIALS.format(7)}, {}, marks=pytest.mark.long),
+        pytest.param({"hardware_id": "world"}, {}, marks=pytest.mark.long),
     ],
 )
 def test_a_second_driver_of_a_stage_does_not_begin(first, second):
@@ -340,7 +340,12 @@ def test_a_second_driver_of_a_stage_does_not_begin(first, second):
 
 
 @pytest.mark.parametrize(
-    ("first", "second"), [({"hardware_id": "A"}, {"hardware_id": "B"}), ({}, {}), ({}, {"axes": ["y"]})]
+    ("first", "second"),
+    [
+        ({}, {}),
+        pytest.param({"hardware_id": "A"}, {"hardware_id": "B"}, marks=pytest.mark.long),
+        pytest.param({}, {"axes": ["y"]}, marks=pytest.mark.long),
+    ],
 )
 def test_another_stage_or_axis_beside_begins(first, second):
     with (

@@ -20,6 +20,8 @@ COMPILED := env -u PYTHONDONTWRITEBYTECODE
 COLCON := $(COMPILED) $(VENV) -c 'import sys; from colcon_core.command import main; sys.exit(main())'
 # every command that starts nodes needs the workspace in its environment
 IN_WORKSPACE := . $(INSTALL)/setup.sh &&
+# what drives simulated stages keeps away from the ROS domain of a real one
+IN_OWN_DOMAIN := $(IN_WORKSPACE) $(VENV) benchmarks/ros_domain.py
 
 VENV_STAMP  := .venv$(SUFFIX)/.stamp
 BUILD_STAMP := $(INSTALL)/.stamp
@@ -135,10 +137,10 @@ package: $(VENV_STAMP)
 	$(VENV) tools/check_package.py --install
 
 demo: build
-	$(IN_WORKSPACE) $(VENV) demo/run_demo.py $(if $(SEED),--seed $(SEED))
+	$(IN_OWN_DOMAIN) $(VENV) demo/run_demo.py $(if $(SEED),--seed $(SEED))
 
 bench: build
-	$(IN_WORKSPACE) $(VENV) benchmarks/run_all.py
+	$(IN_OWN_DOMAIN) $(VENV) benchmarks/run_all.py
 
 bench-robustness: build
 	$(VENV) benchmarks/robustness.py
@@ -161,13 +163,13 @@ bench-platforms: build
 	$(VENV) benchmarks/platforms.py $(RECORD) .venv .venv-jazzy
 
 bench-latency: build
-	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/latency.py --keep
+	$(IN_OWN_DOMAIN) $(VENV) benchmarks/latency.py --keep
 
 bench-loop-rate: build
-	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/loop_rate.py
+	$(IN_OWN_DOMAIN) $(VENV) benchmarks/loop_rate.py
 
 bench-recorder: build
-	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/recorder.py $(RECORDER)
+	$(IN_OWN_DOMAIN) $(VENV) benchmarks/recorder.py $(RECORDER)
 
 bench-oscillation: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) -m benchmarks.oscillation
@@ -176,37 +178,37 @@ bench-learning: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/learning.py $(LEARNING)
 
 bench-driver: build
-	$(IN_WORKSPACE) $(VENV) benchmarks/driver.py
+	$(IN_OWN_DOMAIN) $(VENV) benchmarks/driver.py
 
 bench-device-faults: build
-	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/device_faults.py
+	$(IN_OWN_DOMAIN) $(VENV) benchmarks/device_faults.py
 
 bench-device-lives: build
-	$(IN_WORKSPACE) $(VENV) benchmarks/device_lives.py
+	$(IN_OWN_DOMAIN) $(VENV) benchmarks/device_lives.py
 
 bench-surroundings: build
 	$(VENV) benchmarks/surroundings.py
 
 bench-restarts: build
-	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/restarts.py
+	$(IN_OWN_DOMAIN) $(VENV) benchmarks/restarts.py
 
 bench-soak: build
-	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/soak.py
+	$(IN_OWN_DOMAIN) $(VENV) benchmarks/soak.py
 
 bench-trajectory: build
-	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/trajectory.py
+	$(IN_OWN_DOMAIN) $(VENV) benchmarks/trajectory.py
 
 bench-xy: build
-	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/xy_stage.py
+	$(IN_OWN_DOMAIN) $(VENV) benchmarks/xy_stage.py
 
 bench-readme: build
-	$(IN_WORKSPACE) $(VENV) -m benchmarks.readme_steps
+	$(IN_OWN_DOMAIN) $(VENV) -m benchmarks.readme_steps
 
 bench-steps: build
-	$(IN_WORKSPACE) PYTHONPATH=.:test ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) -m benchmarks.steps $(STEPS)
+	$(IN_OWN_DOMAIN) env PYTHONPATH=.:test $(VENV) -m benchmarks.steps $(STEPS)
 
 bench-faults: build
-	$(IN_WORKSPACE) ROS_AUTOMATIC_DISCOVERY_RANGE=LOCALHOST $(VENV) benchmarks/faults.py $(FAULTS)
+	$(IN_OWN_DOMAIN) $(VENV) benchmarks/faults.py $(FAULTS)
 
 # A tool of its own environment: what it needs is not what the package needs. A package that could not be asked for is a
 # failure (--strict), as nothing is known of it then.
@@ -235,7 +237,7 @@ bench-agreement: build
 	$(IN_WORKSPACE) PYTHONPATH=.:test OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/agreement.py
 
 bench-calibrator: build
-	$(IN_WORKSPACE) OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/calibrator.py
+	$(IN_OWN_DOMAIN) env OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/calibrator.py
 
 bench-confusion: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/confusion.py

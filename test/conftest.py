@@ -1,10 +1,8 @@
 """What all tests share: a ROS graph of their own, the installed programs and the measured data."""
 
-import atexit
 import fcntl
 import os
 import signal
-import tempfile
 import time
 from collections.abc import Callable, Generator
 from contextlib import suppress
@@ -13,6 +11,8 @@ from typing import Any
 
 import hypothesis
 import pytest
+
+from benchmarks.ros_domain import keep_to_own_domain
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 # The folder whose tests start nodes.
@@ -23,22 +23,6 @@ TOGETHER = ("fleet", "documentation")
 COMPUTES = ("test_identify.py", "test_site.py")
 # Younger shared memory is left alone, s.
 NEW_S = 10.0
-
-
-def _reserve_ros_domain() -> int:
-    """Take a ROS domain that no other test run of this machine uses until this process ends."""
-    domains = range(1, 102)  # the ones that are safe on every system
-    for turn in range(len(domains)):
-        domain = domains[(os.getpid() + turn) % len(domains)]
-        lock = open(Path(tempfile.gettempdir()) / f"slpi_ros_test_domain_{os.getuid()}_{domain}.lock", "w")  # noqa: SIM115
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            lock.close()
-            continue
-        atexit.register(lock.close)  # keeps the file, and with it the lock, until the end
-        return domain
-    raise RuntimeError("all ROS domains are taken by other test runs; wait for one to end")
 
 
 def _remove_shared_memory() -> None:
@@ -59,8 +43,7 @@ for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_threads, "1")
 
 # Set before any test module imports rclpy; the nodes that tests start inherit both.
-os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
-os.environ["ROS_DOMAIN_ID"] = str(_reserve_ros_domain())
+keep_to_own_domain()
 
 # A shell starts background jobs with SIGINT ignored, and the nodes that tests start and interrupt inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -30,11 +30,13 @@ class Listening(Rule):
         self.beside: Sequence[str] = ()  # the other publishers at the last look
         self.playing = False  # a driver plays a block
         self._others = others
+        self._first_ns = self._state_ns = 0  # the first `begin`, and when the stage was heard first
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
         """Listen from now on."""
-        self._begun_ns, self._state_ns, self._heard_ns = now_ns, 0, 0
+        self._first_ns = self._first_ns or now_ns
+        self._begun_ns, self._heard_ns = now_ns, 0
         self._patience_ns = QUIET_NS + random.randrange(RANDOM_NS)
         self._alone = False
 
@@ -65,7 +67,7 @@ class Listening(Rule):
 
     def _looked(self, now_ns: int) -> bool:
         """Return whether the others have had the time to be known."""
-        return graph_known(now_ns, self._begun_ns, self._state_ns)
+        return graph_known(now_ns, self._first_ns, self._state_ns)
 
     @property
     def _named(self) -> str:

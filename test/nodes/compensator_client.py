@@ -96,6 +96,7 @@ class Client:
 
     def ask(self, names: Sequence[str], displacements: Sequence[float], stamp_ns: int = 0) -> list[float]:
         """Return the voltages for one message."""
+        self.ready()
         before = len(self._answers)
         self.wish(names, displacements, stamp_ns)
         self.graph.spin_until(lambda: len(self._answers) > before, "an answer")

@@ -8,6 +8,7 @@ from pathlib import Path
 
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.stage_name import stage_name
+from slpi_ros.io.unfinished_bags import abandoned_in, place_of
 from slpi_ros.model.document import load_model
 from slpi_ros.model.stage_model import StageModel
 
@@ -35,7 +36,7 @@ def find_bags(sources: Sequence[_Path]) -> list[Bag]:
     if not sources:
         raise UsageError("no source given; name bags, folders of bags or CSV lists of bags")
     found: dict[str, str] = {}
-    for source in map(Path, sources):
+    for source in map(place_of, map(Path, sources)):
         if not source.exists():
             raise RecordError(f"{source}: no such bag, folder or list; check the path")
         entries = _listed(source) if source.suffix == ".csv" else ((path, "") for path in _bags_below(source))
@@ -82,7 +83,7 @@ def load_models(folder: _Path | None) -> dict[str, StageModel]:
 
 def _bags_below(path: Path) -> Iterator[Path]:
     """Yield the bag at a path, or the bags below it if it is a folder without a bag of its own."""
-    if path.is_file() or (path / "metadata.yaml").exists():
+    if path.is_file() or (path / "metadata.yaml").exists() or path == abandoned_in(path.parent):
         yield path
         return
     entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))

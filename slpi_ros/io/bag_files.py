@@ -24,7 +24,7 @@ from slpi_ros.io.input_limits import (
     read_input,
     require_inputs,
 )
-from slpi_ros.io.unfinished_bags import abandoned_in, is_being_written, partial_path
+from slpi_ros.io.unfinished_bags import abandoned_in, is_being_written, partial_path, place_of
 
 SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 # The parts of a split bag end in their number.
@@ -42,14 +42,11 @@ _BLOCK = 2**20
 
 def locate(path: Path) -> list[Path]:
     """Return the paths to open for a bag: a folder with metadata, or its bag files in order; RecordError if none."""
-    # A killed recorder leaves a bag in its partial folder, which may be named by either.
-    partial = path if path.is_dir() or not path.name else partial_path(path)
-    if (left := abandoned_in(partial)) and (path == partial or not path.exists()):
-        path = left
+    path = place_of(path)
     if not path.exists():
         hint = _WANTED
-        if path.name and is_being_written(partial):
-            hint = f"its recording is unfinished, in {partial}: wait for the recorder to end"
+        if path.name and is_being_written(partial_path(path)):
+            hint = f"its recording is unfinished, in {partial_path(path)}: wait for the recorder to end"
         raise RecordError(f"{path}: no such bag; {hint}")
     if path.is_file():
         if path.name.endswith(SUFFIXES):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from slpi_ros.errors import RecordError
 from slpi_ros.io.input_limits import BAG_BYTES, open_input
+from slpi_ros.io.unfinished_bags import place_of
 
 # Bytes that are read at once.
 PART = 1 << 20
@@ -16,7 +17,7 @@ def digests(path: str | os.PathLike[str]) -> dict[str, str]:
 
     Equal to what ``sha256sum`` prints.
     """
-    place = Path(path)
+    place = place_of(Path(path))
     try:
         if not place.is_dir():
             return {place.name: _digest(place)}
@@ -27,8 +28,8 @@ def digests(path: str | os.PathLike[str]) -> dict[str, str]:
 
 
 def _digest(path: Path) -> str:
-    found = hashlib.sha256()
+    digest = hashlib.sha256()
     with open_input(path, BAG_BYTES) as file:
         while part := file.read(PART):
-            found.update(part)
-    return found.hexdigest()
+            digest.update(part)
+    return digest.hexdigest()

@@ -59,9 +59,18 @@ def is_being_written(partial: Path) -> bool:
 
 def abandoned_in(partial: Path) -> Path | None:
     """Return the folder of the bag that a killed recorder left in `partial`; None if there is none."""
+    if not partial.name:
+        return None
     bag = partial / partial.name[1:].removesuffix(".partial")
     is_one = partial == partial_path(partial.with_name(bag.name)) and bag.is_dir() and any(bag.iterdir())
     return bag if is_one and not is_being_written(partial) else None
+
+
+def place_of(path: Path) -> Path:
+    """Return where the bag of a path is: there, or where a killed recorder left it, which both paths may name."""
+    partial = path if path.is_dir() or not path.name else partial_path(path)
+    left = abandoned_in(partial) if path == partial or not path.exists() else None
+    return left or path
 
 
 def is_abandoned(file: Path) -> bool:

@@ -42,8 +42,8 @@ class Recorder(Node):
 
     Subscribes to the topics named by the parameter ``topics``, with the reliability and durability that their
     publishers offer; messages are not deserialized. An incomplete bag is kept in ``.NAME.partial`` in
-    the folder of the output, from which it is read if the recorder was killed: at most its last second is lost.
-    Parameters in `DECLARATIONS`.
+    the folder of the output, from which it is read if the recorder was killed: at most its last second is then
+    lost; parameters in `DECLARATIONS`.
     """
 
     def __init__(self) -> None:

@@ -5,16 +5,20 @@ import shutil
 import signal
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
+from forked import completed
 from refusals import holds, refusal
 
 from slpi_ros.errors import RecordError
+from slpi_ros.fleet.sources import find_bags
 from slpi_ros.io.bag_files import BagWatch
 from slpi_ros.io.bag_reader import read_bag
 from slpi_ros.io.bag_writer import BagWriter
-from slpi_ros.io.unfinished_bags import NOTE, is_being_written, partial_path
+from slpi_ros.io.digests import digests
+from slpi_ros.io.unfinished_bags import NOTE, is_being_written, partial_path, place_of
 
 # Messages on the disk, and further ones that the process takes with it; the second time SQLite has written some of
 # these to its file, and needs its journal to undo them.
@@ -125,3 +129,21 @@ def test_a_complete_bag_of_the_name_comes_first(tmp_path):
     shutil.move(tmp_path / "aside", partial_path(tmp_path / "bag"))
     assert os.listdir(tmp_path / "bag")
     assert holds(refusal(RecordError, read_bag, tmp_path / "bag"), tmp_path / "bag")
+
+
+def test_places_that_are_no_recording(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / ".bag.partial").mkdir()
+    (tmp_path / ".other.partial" / "bag").mkdir(parents=True)
+    for path in (Path("/"), Path(), Path(".."), Path("bag"), Path("other"), Path(".other.partial")):
+        assert place_of(path) == path
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_commands_take_it_by_its_name(tmp_path, storage):
+    killed(writing(tmp_path / "bag", storage))
+    assert len(digests(tmp_path / "bag")) >= 1
+    (bag,) = find_bags([tmp_path / "bag"])
+    assert bag.size > 0
+    done = completed("slpi_ros.cli:main", ["doctor", str(tmp_path / "bag"), "--no-ros", "-v"])
+    assert "killed" in done.stdout

@@ -66,6 +66,7 @@ def benched(tmp_path, **options):
         address = "{}:{}".format(*server.getsockname())
     device = {"address": address, "voltage": 20.0, "noise_rms": 0.0}
     driver = {"device": "gcs", "address": address, "rate": 50.0, "slew_limit": 1.1 * SLEW, **limits}
+    driver["hardware_id"] = model.hardware_id
     compensator = {
         "model_file": str(tmp_path / "model.json"),
         "slew_limit": SLEW,

@@ -55,9 +55,9 @@ class Listening(Rule):
         if self._heard_ns and now_ns - self._heard_ns < QUIET_NS:
             self.beside = self._others()
             return self._finding(f"{self._named} commands the stage; end it, or do not use this node")
-        if self._alone or now_ns - self._begun_ns >= self._patience_ns and self._looked(now_ns):
+        if self._alone or now_ns - self._begun_ns >= self._patience_ns and self.looks(now_ns):
             return None
-        if not self._looked(now_ns):
+        if not self.looks(now_ns):
             return self._finding("looking who else commands the stage; send it again")
         self.beside = self._others()
         self._alone = not self.beside and not self._heard_ns
@@ -65,7 +65,7 @@ class Listening(Rule):
             return None
         return self._finding(f"listening whether {self._named} commands the stage; send it again")
 
-    def _looked(self, now_ns: int) -> bool:
+    def looks(self, now_ns: int) -> bool:
         """Return whether the others have had the time to be known."""
         return graph_known(now_ns, self._first_ns, self._state_ns)
 

@@ -57,11 +57,11 @@ class Company:
         self._listening = self._ownership.listening = Listening(lambda: publishers_beside(node, self._topics[COMMAND]))
         self._commands: Any = None
         self._probe: StateProbe | None = None
-        self._looked_ns = self._probed_ns = self._began_ns = 0
+        self._looked_ns = self._probed_ns = self._known_ns = 0  # of the graph, of the probe, when the graph was known
         self._reporters = 0
         for rule in self._ownership.reporters.values():
             rule.publishers = lambda: publishers_beside(node, self._topics[STATE])
-        self._beside: list[str] = []  # other publishers of the voltages when the output began
+        self._beside: list[str] = []  # other publishers of the voltages then
 
     def listen(self) -> None:
         """Listen from now on: nothing is output."""
@@ -89,7 +89,6 @@ class Company:
         """Look at the graph once a second; stop listening when a voltage has been output."""
         if self._ownership.started and self._commands is not None:
             self.close()
-            self._began_ns, self._beside = now_ns, self._others
         if now_ns - self._looked_ns >= GRAPH_NS:
             self._looked_ns = now_ns
             self._look_at_graph(now_ns)
@@ -100,14 +99,12 @@ class Company:
                 self._probe = None
 
     def _look_at_graph(self, now_ns: int) -> None:
-        others = self._others
-        # Those that were there before and are still there are alive.
-        dead = self._beside if now_ns - self._began_ns < LEFT_NS else []
-        self.newcomers = [name for name in others if name not in dead] if self._commands is None else []
+        others = publishers_beside(self._node, self._topics[COMMAND])
+        if not self._known_ns and self._listening.looks(now_ns):
+            self._known_ns, self._beside = now_ns, others
+        # Those that were there at the beginning may have been killed before.
+        dead = self._beside if now_ns - self._known_ns < LEFT_NS else []
+        self.newcomers = [name for name in others if name not in dead] if self._known_ns else []
         before, self._reporters = self._reporters, self._node.count_publishers(self._topics[STATE])
         if self._reporters > max(before, 1):
             self._probe, self._probed_ns = self._probe or StateProbe(self._node), now_ns
-
-    @property
-    def _others(self) -> list[str]:
-        return publishers_beside(self._node, self._topics[COMMAND])

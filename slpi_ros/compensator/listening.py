@@ -22,23 +22,23 @@ def graph_known(now_ns: int, begun_ns: int, state_ns: int) -> bool:
 class Listening(Rule):
     """Nobody else commands the stage: listens from `begin` on until the first voltage, on the steady clock, ns.
 
-    `others` returns the other publishers of the topic of the voltages that the graph knows now. One of them that is
-    silent may be a process that was killed.
+    `others` returns the other publishers of the topic of the voltages that the graph knows now. One that is silent,
+    from when it was known on, may be a process that was killed.
     """
 
     def __init__(self, others: Callable[[], Sequence[str]]) -> None:
-        self.beside: Sequence[str] = ()  # the other publishers at the last look
         self.playing = False  # a driver plays a block
         self._others = others
-        self._first_ns = self._state_ns = 0  # the first `begin`, and when the stage was heard first
+        self._beside: Sequence[str] = ()  # the others at the last look
+        self._begun_ns = self._state_ns = 0  # the first `begin`, and when the stage was heard first
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
         """Listen from now on."""
-        self._first_ns = self._first_ns or now_ns
-        self._begun_ns, self._heard_ns = now_ns, 0
+        self._begun_ns = self._begun_ns or now_ns
+        self._known_ns = now_ns  # since when all of them have been known
+        self._heard_ns: int | None = None
         self._patience_ns = QUIET_NS + random.randrange(RANDOM_NS)
-        self._alone = False
 
     def state(self, now_ns: int) -> None:
         """Take that the stage has reported."""
@@ -50,28 +50,24 @@ class Listening(Rule):
 
     def check(self, now_ns: int) -> Finding | None:
         """Return what holds the first voltage back, None if nothing does."""
+        others = self._others()
+        if set(others) - set(self._beside):
+            self._known_ns = now_ns
+        self._beside = others
+        named = ", ".join(others) or "another node"
         if self.playing:
             return self._finding("the driver plays a block; wait for its end")
-        if self._heard_ns and now_ns - self._heard_ns < QUIET_NS:
-            self.beside = self._others()
-            return self._finding(f"{self._named} commands the stage; end it, or do not use this node")
-        if self._alone or now_ns - self._begun_ns >= self._patience_ns and self.looks(now_ns):
-            return None
+        if self._heard_ns is not None and now_ns - self._heard_ns < QUIET_NS:
+            return self._finding(f"{named} commands the stage; end it, or do not use this node")
         if not self.looks(now_ns):
             return self._finding("looking who else commands the stage; send it again")
-        self.beside = self._others()
-        self._alone = not self.beside and not self._heard_ns
-        if self._alone:
-            return None
-        return self._finding(f"listening whether {self._named} commands the stage; send it again")
+        if others and now_ns - self._known_ns < self._patience_ns:
+            return self._finding(f"listening whether {named} commands the stage; send it again")
+        return None
 
     def looks(self, now_ns: int) -> bool:
         """Return whether the others have had the time to be known."""
-        return graph_known(now_ns, self._first_ns, self._state_ns)
-
-    @property
-    def _named(self) -> str:
-        return ", ".join(self.beside) or "another node"
+        return graph_known(now_ns, self._begun_ns, self._state_ns)
 
     @staticmethod
     def _finding(reason: str) -> Finding:

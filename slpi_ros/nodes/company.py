@@ -89,6 +89,9 @@ class Company:
         """Look at the graph once a second; stop listening when a voltage has been output."""
         if self._ownership.started and self._commands is not None:
             self.close()
+        elif not self._known_ns:
+            # Whom the graph tells first is listened to from then on.
+            self._listening.check(now_ns)
         if now_ns - self._looked_ns >= GRAPH_NS:
             self._looked_ns = now_ns
             self._look_at_graph(now_ns)

@@ -37,6 +37,18 @@ def test_beside_a_silent_one_it_listens_as_long_as_that_would_take_to_be_heard(s
     assert QUIET_NS <= free_after(rule) <= QUIET_NS + RANDOM_NS + 10 * MS
 
 
+def test_it_listens_from_when_the_graph_knows_of_another_one():
+    others = []
+    rule = Listening(lambda: list(others))
+    rule.begin(BEGIN)
+    rule.state(BEGIN)
+    assert rule.check(BEGIN + LOOK_NS) is None
+    others.append("/other")
+    assert rule.check(BEGIN + 9_000 * MS) is not None
+    assert rule.check(BEGIN + 9_000 * MS + QUIET_NS - MS) is not None
+    assert rule.check(BEGIN + 9_000 * MS + QUIET_NS + RANDOM_NS) is None
+
+
 def test_it_names_who_commands_and_goes_on_when_that_has_ended():
     rule = listening("/other")
     rule.state(BEGIN)

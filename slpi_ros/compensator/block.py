@@ -14,7 +14,7 @@ from slpi_ros.compensator.monitor import Finding, Rule, Silence
 from slpi_ros.compensator.trajectory import Trajectory, require_mean_rate
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.model.limits import RateLimiter
+from slpi_ros.model.limits import Limits, RateLimiter
 from slpi_ros.model.streaming import StageStream
 
 # Most samples of a block: their voltages take some seconds to compute.
@@ -100,6 +100,16 @@ def plan(path: Trajectory, axes: Sequence[Axis], stage: StageStream | None, peri
     for axis, v in zip(moved, voltages.T, strict=True):
         require_mean_rate(axis.name, np.arange(v.size) * period, v, axis.output.limits.mean_rate)
     return Block(stamp_ns, names, period, voltages, lead_in, missed)
+
+
+def require_mean_rates(path: Trajectory, axes: Sequence[Axis]) -> None:
+    """Reject a path whose voltages have too high a mean rate, as the models of its axes tell."""
+    t: FloatArray = path.time_from_start_ns.astype(np.float64) * 1e-9
+    for axis in axes:
+        if axis.name in path.names and axis.model and axis.output.limits.mean_rate < inf:
+            within = Limits(axis.stream.limits.lower, axis.stream.limits.upper)
+            v, _ = axis.model.compensate(t, path.positions[:, path.names.index(axis.name)], within)
+            require_mean_rate(axis.name, t, v, axis.output.limits.mean_rate)
 
 
 @contextmanager

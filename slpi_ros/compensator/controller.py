@@ -4,16 +4,13 @@ from array import array
 from collections.abc import Mapping, Sequence
 from datetime import datetime
 from enum import Enum
-from math import inf
 
-import numpy as np
 from numpy.typing import ArrayLike
 
-from slpi_ros.arrays import FloatArray
 from slpi_ros.compensator import validation as rejection
 from slpi_ros.compensator.amplifier import STEADY_NS
 from slpi_ros.compensator.axis import Axis
-from slpi_ros.compensator.block import Block, BlockFollower, plan
+from slpi_ros.compensator.block import Block, BlockFollower, plan, require_mean_rates
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
 from slpi_ros.compensator.messages import Messages
 from slpi_ros.compensator.monitor import Finding, Monitor
@@ -34,7 +31,7 @@ from slpi_ros.compensator.persistence import RESETTING, SENSOR, MemoryConfidence
 from slpi_ros.compensator.reporters import WhoseStage
 from slpi_ros.compensator.statistics import Counts
 from slpi_ros.compensator.surroundings import Surroundings
-from slpi_ros.compensator.trajectory import Trajectory, TrajectoryExecutor, require_mean_rate
+from slpi_ros.compensator.trajectory import Trajectory, TrajectoryExecutor
 from slpi_ros.compensator.validation import RejectedError, TimestampRules
 from slpi_ros.compensator.watchdog import CommandWatchdog
 from slpi_ros.errors import SlpiError, UsageError
@@ -295,6 +292,10 @@ class Controller:
             axis = self.messages.by_name.get(name)
             if axis:
                 axis.amplifier.report(voltage, now_ns)
+        return self.judge(now_ns)
+
+    def judge(self, now_ns: int) -> bool:
+        """Return whether somebody else has begun to move, command or report an axis; all then stops until `arm`."""
         if not self.ownership.lost(now_ns):
             return False
         self.stop(StopReason.LOST, now_ns)
@@ -421,7 +422,7 @@ class Controller:
             return
         try:
             path = self._path(Kind.TRAJECTORY, names, time_from_start_ns, positions, start_ns, now_ns)
-            self._require_mean_rates(path)
+            require_mean_rates(path, self.axes)
             delays = {axis.name: axis.model.chain.delay for axis in self.axes if axis.model}
             self.trajectory.start(path, clock_ns, delays, {axis.name: axis.stream for axis in self.axes})
         except RejectedError:
@@ -472,15 +473,6 @@ class Controller:
         path.check_reach({axis.name: axis.stream.accepted for axis in self.axes})
         self.ownership.begin_output(now_ns)
         return path
-
-    def _require_mean_rates(self, path: Trajectory) -> None:
-        """Reject a path whose voltages have too high a mean rate, as the models of its axes tell."""
-        t: FloatArray = path.time_from_start_ns.astype(np.float64) * 1e-9
-        for axis in self.axes:
-            if axis.name in path.names and axis.model and axis.output.limits.mean_rate < inf:
-                within = Limits(axis.stream.limits.lower, axis.stream.limits.upper)
-                v, _ = axis.model.compensate(t, path.positions[:, path.names.index(axis.name)], within)
-                require_mean_rate(axis.name, t, v, axis.output.limits.mean_rate)
 
     def hear_block(self, stamp_ns: int, state: str, sample: int, reason: str, now_ns: int) -> bool:
         """Take what a driver tells of a block; return whether the present one has ended with it."""

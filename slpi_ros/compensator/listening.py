@@ -20,7 +20,7 @@ def graph_known(now_ns: int, begun_ns: int, state_ns: int) -> bool:
 
 
 class Listening(Rule):
-    """Nobody else commands the stage: listens from `begin` on until the first voltage, on the steady clock, ns.
+    """Nobody else commands the stage, or the first voltage is held back: listens from `begin` on; steady clock, ns.
 
     `others` returns the other publishers of the topic of the voltages that the graph knows now. One that is silent,
     from when it was known on, may be a process that was killed.
@@ -64,6 +64,17 @@ class Listening(Rule):
         if others and now_ns - self._known_ns < self._patience_ns:
             return self._finding(f"listening whether {named} commands the stage; send it again")
         return None
+
+    def heard_since(self, begun_ns: int) -> Finding | None:
+        """Return that somebody else has commanded the stage since the output began at a time (ns)."""
+        if self._heard_ns is None or self._heard_ns <= begun_ns:
+            return None
+        named = ", ".join(self._others()) or "another node"
+        return self._finding(f"{named} commands the stage too; end it, then call ~/arm")
+
+    def found_all(self, now_ns: int) -> bool:
+        """Return whether the middleware has had the time to find everybody, on a busy machine too."""
+        return now_ns - self._begun_ns >= LOOK_WITHOUT_NS
 
     def looks(self, now_ns: int) -> bool:
         """Return whether the others have had the time to be known."""

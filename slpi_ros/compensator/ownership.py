@@ -37,7 +37,7 @@ class Ownership:
         self.monitor = Monitor(*(axis.amplifier for axis in axes))
         self._axes = axes
         self._starts = list(starts) or [AUTO] * len(axes)  # `AUTO`, `MEASURED`, `SAVED`, or volts
-        self._since_ns, self._ever = 0, False
+        self._since_ns, self._begun_ns, self._ever = 0, 0, False
 
     @property
     def armed(self) -> bool:
@@ -104,7 +104,7 @@ class Ownership:
         if self.obstacle:
             raise RejectedError(*self.obstacle)
         if not self.started:
-            self.started = self._ever = True
+            self.started, self._ever, self._begun_ns = True, True, now_ns
             for axis in self._axes:
                 self._take(axis, now_ns)
 
@@ -112,7 +112,7 @@ class Ownership:
         """Return whether somebody else has begun to move or to report an axis; nothing is then output until `arm`."""
         if not (self.started and self.armed):
             return False
-        found = self._stranger(now_ns)
+        found = self._stranger(now_ns) or (self.listening and self.listening.heard_since(self._begun_ns))
         if not found:
             self.monitor.check(now_ns)
             found = next(iter(self.monitor.standing), None)
@@ -137,6 +137,7 @@ class Ownership:
             if reason := self._impossible(axis, voltage):
                 return f"axis '{axis.name}': {reason}"
             found.append(voltage)
+        self._begun_ns = now_ns
         for axis, voltage in zip(self._axes, found, strict=True):
             # The last output of an axis that nobody moved is known better than a noisy report of it.
             if axis.amplifier.foreign or abs(voltage - axis.voltage) > axis.amplifier.scatter:

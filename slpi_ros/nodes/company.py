@@ -52,7 +52,8 @@ class Company:
 
     def __init__(self, node: Node, controller: Controller) -> None:
         self.newcomers: list[str] = []  # other publishers of the voltages that are alive, as far as is known
-        self._node, self._ownership = node, controller.ownership
+        self._node, self._controller, self._ownership = node, controller, controller.ownership
+        self.own: set[bytes] = set()  # voltages of this node while it listens
         self._topics = {topic: node.resolve_topic_name(topic) for topic in (STATE, COMMAND)}
         self._listening = self._ownership.listening = Listening(lambda: publishers_beside(node, self._topics[COMMAND]))
         self._commands: Any = None
@@ -68,9 +69,19 @@ class Company:
         self._listening.begin(time.monotonic_ns())
         if self._commands is None:
             self._commands = self._node.create_subscription(
-                Float64MultiArray, COMMAND, lambda _: self._listening.hear(time.monotonic_ns()), MEASUREMENTS, raw=True
+                Float64MultiArray, COMMAND, self._on_command, MEASUREMENTS, raw=True
             )
         self._probe = self._probe or StateProbe(self._node)
+
+    @property
+    def listens(self) -> bool:
+        """Whether voltages of others are heard."""
+        return self._commands is not None
+
+    def _on_command(self, data: bytes) -> None:
+        """Take a voltage, which may be one of this node."""
+        if data not in self.own:
+            self._listening.hear(time.monotonic_ns())
 
     def heard(self, now_ns: int) -> None:
         """Take that the stage has reported."""
@@ -81,6 +92,7 @@ class Company:
         if self._commands is not None:
             self._node.destroy_subscription(self._commands)
             self._commands = None
+            self.own.clear()
         if self._probe:
             self._probe.close()
             self._probe = None
@@ -88,7 +100,9 @@ class Company:
     def look(self, now_ns: int) -> None:
         """Look at the graph once a second; stop listening when a voltage has been output."""
         if self._ownership.started and self._commands is not None:
-            self.close()
+            self._controller.judge(now_ns)
+            if self._listening.found_all(now_ns):
+                self.close()
         elif not self._known_ns:
             # Whom the graph tells first is listened to from then on.
             self._listening.check(now_ns)

@@ -156,7 +156,7 @@ class Compensator(LifecycleNode):
             # Until this node may know whether stage_state has a publisher: commands are not taken before that.
             while not self._is_reported and time.monotonic_ns() - self._begun_ns < DISCOVERY_NS and self.context.ok():
                 time.sleep(DISCOVERY_POLL)
-        self._paths.output = self._output = Output(self, self._controller, self._memory, self._reporter)
+        self._paths.output = self._output = Output(self, self._controller, self._memory, self._reporter, self._company)
         on_desired: dict[str, tuple[Any, Any]] = {
             "JointState": (JointState, self._on_joint_state),
             "Float64": (Float64, lambda message: self._answer(0, self._controller.names, (message.data,))),

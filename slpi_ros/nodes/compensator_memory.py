@@ -82,11 +82,13 @@ class Memory:
         idle = controller.mode in (OperatingMode.STREAMING, OperatingMode.RAMPING)
         if controller.model is None or not idle or not unsure:
             return
-        # As soon as the voltages are known.
-        self.waits = controller.ownership.obstacle is not None
+        resets, ownership = self._reporter.settings.values["reset_on_start"], controller.ownership
+        # As soon as the voltages are known; nobody waits for a reset, so that it is begun when all others are found.
+        alone = ownership.listening is None or ownership.listening.found_all(time.monotonic_ns())
+        self.waits = ownership.obstacle is not None or (resets and not alone)
         if self.waits:
             return
-        if self._reporter.settings.values["reset_on_start"]:
+        if resets:
             self._start_reset()
             return
         said = "; ".join(f"axis '{axis.name}' {_assumed(axis)}" for axis in unsure)

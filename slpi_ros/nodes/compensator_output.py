@@ -17,6 +17,7 @@ from slpi_ros.compensator.listening import REPEAT_NS
 from slpi_ros.io.cdr import multiarray_header
 from slpi_ros.io.messages import encode_trajectory
 from slpi_ros.nodes.common import COMMANDS, DIAGNOSTICS
+from slpi_ros.nodes.company import Company
 from slpi_ros.nodes.compensator_diagnostics import Reporter
 from slpi_ros.nodes.compensator_memory import Memory
 
@@ -29,7 +30,10 @@ PATIENCE = Duration(seconds=1.0)
 class Output:
     """The publishers of a configured compensator."""
 
-    def __init__(self, node: LifecycleNode, controller: Controller, memory: Memory, reporter: Reporter) -> None:
+    def __init__(
+        self, node: LifecycleNode, controller: Controller, memory: Memory, reporter: Reporter, company: Company
+    ) -> None:
+        self._company = company
         self._node, self._controller, self._memory, self._reporter = node, controller, memory, reporter
         self._header = multiarray_header(len(controller.names))
         self._published, self._published_ns = False, 0  # since the last look; when that was
@@ -50,7 +54,10 @@ class Output:
         # As bytes: creating a message object takes longer than compensating an axis.
         voltages = self._controller.voltages.tobytes()
         self._memory.note(voltages)
-        self._voltages.publish(self._header + voltages)
+        message = self._header + voltages
+        if self._company.listens:
+            self._company.own.add(message)
+        self._voltages.publish(message)
         self._published = True
 
     def wait(self) -> None:

@@ -81,6 +81,7 @@ def cost(source: Source, pythons: Sequence[str], rate: float, seconds: float) ->
             for node in nodes:
                 node.send_signal(signal.SIGINT)
                 node.wait()
+            source.wait_for(0)
             # The first, of which the others are multiples, is this environment.
             told = ", ".join(f"{each / sent * 1e6:.1f} us a message" for each in used)
             print(f"{storage:8} {rate:g} Hz, {sent} messages: {told}; ratio {used[0] / used[-1]:.2f}", flush=True)

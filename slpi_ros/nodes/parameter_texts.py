@@ -21,9 +21,11 @@ Texts = Iterator[tuple[str, str, str]]
 
 
 def _options(arguments: Sequence[str], *names: str) -> Iterator[str]:
-    """Yield the values of the options of these names."""
+    """Yield the values of the options for ROS of these names."""
+    of_ros = False
     for option, value in zip(arguments, arguments[1:], strict=False):
-        if option in names:
+        of_ros = option == "--ros-args" or (of_ros and option != "--")
+        if of_ros and option in names:
             yield value
 
 

@@ -33,7 +33,7 @@ path, storage, synced, lost, spilled = sys.argv[1], sys.argv[2], *map(int, sys.a
 bag = BagWriter(path, storage=storage)
 count = synced + lost
 t = np.arange(1, count + 1, dtype=np.int64) * 1_000_000
-messages = encode_joint_states(t, np.arange(count)[:, None] * 1e-9, np.ones((count, 1)), ("x",), "stage-7")
+messages = encode_joint_states(t, np.arange(count)[:, None] * 1e-9, np.arange(count)[:, None] * 0.01, ("x",), "stage-7")
 if spilled:
     bag._writer.storage.conn.execute("PRAGMA cache_size = 1")
 for row, message in enumerate(messages):
@@ -146,4 +146,4 @@ def test_commands_take_it_by_its_name(tmp_path, storage):
     (bag,) = find_bags([tmp_path / "bag"])
     assert bag.size > 0
     done = completed("slpi_ros.cli:main", ["doctor", str(tmp_path / "bag"), "--no-ros", "-v"])
-    assert "killed" in done.stdout
+    assert holds(done.stdout, tmp_path / "bag", "axis")

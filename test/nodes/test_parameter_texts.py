@@ -39,8 +39,12 @@ def test_a_start_that_fails_says_what_to_quote(tmp_path, text, quoted, in_file):
         assert node.stderr.splitlines()[-1].endswith(f"quote it: -p {name}:={quoted}")
 
 
+def test_options_that_are_none_of_ros_are_left_alone():
+    assert not list(leading_zeros(["-p", "seed:=010", "--ros-args", "--", "-p", "seed:=010"]))
+
+
 def test_another_error_is_left_as_it_is():
-    assert remedy(["-p", "seed:=soon"], "seed is of type STRING, expecting INTEGER") == ""
+    assert remedy(["--ros-args", "-p", "seed:=soon"], "seed is of type STRING, expecting INTEGER") == ""
 
 
 OWN, ALL = "node:\n  ros__parameters:\n    top: 50.0\n", "/**:\n  ros__parameters:\n    top: 100.0\n    low: 1.0\n"

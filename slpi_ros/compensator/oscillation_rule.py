@@ -213,7 +213,7 @@ class OscillationRule(Rule):
         return None
 
     def _strongest(self, spectrum: Spectrum, fast: bool) -> Oscillation | None:
-        """Return the strongest oscillation that is not there without feedback, in a long time if no shorter shows it."""
+        """Return the strongest oscillation that is not there without feedback; a long time shows only slow ones."""
         for k in spectrum.peaks():
             found = Oscillation(spectrum.frequency(k), float(spectrum.near[k]))
             if found.amplitude <= self._least:

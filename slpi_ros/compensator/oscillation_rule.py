@@ -208,7 +208,7 @@ class OscillationRule(Rule):
                 if not signals[1].size or float(np.ptp(signals[1])) <= self._least:
                     break
             seconds *= 2.0**0.5
-        if not loud:
+        if not loud and elapsed >= SECONDS * SHOWN:
             self._alone = None
         return None
 

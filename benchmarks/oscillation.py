@@ -33,7 +33,7 @@ from slpi_ros.simulation.parameters import AxisParameters
 BEGIN_NS, SECOND_NS, WATCH_NS = 10**12, 10**9, 50_000_000
 NOISE, NOISES, SECONDS, PERIODS = 5e-9, 4.0, 2.0, 4.0
 SAFETY = Safety(0.0, False, False, (0.0,), 50.0)
-LIMITS = Limits(0.0, 100.0, 20_000.0)
+LIMITS = Limits(0.0, 100.0)
 Path = Callable[[float], float]
 
 

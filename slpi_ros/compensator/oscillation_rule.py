@@ -3,6 +3,7 @@
 from array import array
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,11 +19,11 @@ IntArray = NDArray[np.int64]
 # What counts as an oscillation, in noises; by when it has to be found, in seconds and in periods.
 NOISES, SECONDS, PERIODS = 4.0, 2.0, 4.0
 # Of that time, the share in which an oscillation has to show, and the one in which the correction is held then.
-SHOWN, HELD = 0.5, 0.35
+SHOWN, HELD = 0.25, 0.35
 # Fewest periods that show an oscillation, and fewest readings; longest time looked at, s.
 SHOWING, FEWEST, LONGEST = 2, 8, 16.0
 # Readings for long times are means over this time, ns.
-MEAN_NS = SECOND_NS // 16
+MEAN_NS = SECOND_NS // 32
 # The signal of one oscillation is within this ratio of its frequency, and within this many lines of the spectrum.
 NEAR, LINES = 2.0**0.25, 2
 
@@ -56,6 +57,12 @@ class Signals:
         return (times[k:] - now_ns) * 1e-9, np.array(self._errors)[k:], np.array(self._setpoints)[k:]
 
 
+@lru_cache(maxsize=32)
+def _window(n: int) -> FloatArray:
+    """Return the window of n values."""
+    return np.hanning(n + 1)[:n]
+
+
 @dataclass(frozen=True)
 class Spectrum:
     """Amplitudes of what oscillates near each frequency: of sines there, their root sum square (m)."""
@@ -70,7 +77,7 @@ class Spectrum:
         """Return the spectrum of errors (m) at times (s), shape (N,) each."""
         n = t.size
         even = np.interp(np.linspace(t[0], t[-1], n), t, error)
-        window = np.hanning(n + 1)[:n]
+        window = _window(n)
         power = np.abs(np.fft.rfft((even - even.mean()) * window)) ** 2 * (4.0 / (n * float(window @ window)))
         if n % 2 == 0:
             power[-1] /= 2.0
@@ -84,6 +91,11 @@ class Spectrum:
     def amplitude(self, frequency: FloatArray | float) -> FloatArray:
         """Return the amplitude (m) near frequencies (Hz)."""
         return np.asarray(np.interp(frequency, self.frequencies, self.near))
+
+    def frequency(self, k: int) -> float:
+        """Return the frequency (Hz) of what shows in line k and those beside it."""
+        beside = slice(max(k - 1, 0), k + 2)
+        return float(np.average(self.frequencies[beside], weights=self.lines[beside] ** 2))
 
     def peaks(self) -> Iterator[int]:
         """Yield the strongest line, the strongest one that is not near it, and so on, but what may come from others."""
@@ -177,11 +189,12 @@ class OscillationRule(Rule):
         return NOISES * (self.noise or RESOLUTION * self.span)
 
     def _look(self, now_ns: int) -> Oscillation | None:
-        """Return the largest oscillation that shows, is not there without feedback, and does not fall."""
-        seconds, loud, elapsed = SECONDS * SHOWN, False, (now_ns - self._begun_ns) * 1e-9
-        self.noticed = False
-        while (fast := seconds == SECONDS * SHOWN) or seconds <= min(LONGEST, elapsed):
-            t, error, setpoint = (self._fast if fast else self._slow).last(seconds, now_ns)
+        """Return an oscillation that shows, is not there without feedback, and does not fall by itself."""
+        elapsed, seconds = (now_ns - self._begun_ns) * 1e-9, SECONDS * SHOWN
+        # A short time first; a longer one only where something moves in the longest.
+        signals, fast, loud, self.noticed = self._fast.last(seconds, now_ns), True, False, False
+        while fast or seconds <= min(LONGEST, elapsed):
+            t, error, setpoint = (each[signals[0] >= -seconds] for each in signals)
             # A sine of that amplitude has at least this spread.
             if t.size >= FEWEST and float(error.std()) * 2.0**0.5 > self._least:
                 loud = True
@@ -190,18 +203,27 @@ class OscillationRule(Rule):
                     self.noticed = self.noticed or found.amplitude > float(error.std())
                     if elapsed >= seconds and self._lasts(t, error, found):
                         return found
+            if fast:
+                signals, fast = self._slow.last(LONGEST, now_ns), False
+                if not signals[1].size or float(np.ptp(signals[1])) <= self._least:
+                    break
             seconds *= 2.0**0.5
-        if not loud:
+        if not loud and elapsed >= SECONDS * SHOWN:
             self._alone = None
         return None
 
     def _strongest(self, spectrum: Spectrum, fast: bool) -> Oscillation | None:
-        """Return the strongest oscillation that counts, in a long time the one that only this shows."""
+        """Return the strongest oscillation that is not there without feedback; a long time shows only slow ones."""
         for k in spectrum.peaks():
-            found = Oscillation(float(spectrum.frequencies[k]), float(spectrum.near[k]))
-            usual = float(self._alone.amplitude(found.frequency)) / LEAST_MARGIN if self._alone else 0.0
-            if found.amplitude > max(usual, self._least) and (k >= SHOWING if fast else k == SHOWING):
+            found = Oscillation(spectrum.frequency(k), float(spectrum.near[k]))
+            if found.amplitude <= self._least:
+                break
+            if self._alone and found.amplitude <= float(self._alone.amplitude(found.frequency)) / LEAST_MARGIN:
+                continue
+            if k == SHOWING or (fast and k > SHOWING):
                 return found
+            if not fast:
+                break
         return None
 
     def _is_slow(self, t: FloatArray, setpoint: FloatArray, of: Oscillation) -> bool:

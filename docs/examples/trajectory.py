@@ -16,12 +16,13 @@ ready = set()
 
 
 def on_diagnostics(array: DiagnosticArray) -> None:
-    """Note whether the compensator, which reports once a second, is active and does not reset the memory."""
+    """Note whether the compensator, which reports once a second, may move and does not reset the memory."""
     for status in array.status:
         values = {pair.key: pair.value for pair in status.values}
         if status.name.endswith("compensator: compensator"):
             print(status.message)
-            if values["state"] == "active" and "resetting" not in values["memory"]:
+            may_move = values["state"] == "active" and not values["obstacle"]
+            if may_move and "resetting" not in values["memory"]:
                 ready.add("compensator")
 
 

@@ -282,20 +282,17 @@ class Controller:
 
     # Where the amplifiers are
 
-    def report(self, names: Sequence[str], voltages: Sequence[float], now_ns: int, stage: str = "") -> bool:
-        """Take the voltages (V) that amplifiers report; return whether somebody now moves an axis, until `arm`.
+    def report(self, names: Sequence[str], voltages: Sequence[float], now_ns: int, stage: str | None = None) -> bool:
+        """Take the voltages (V) that amplifiers report, and the name that the stage gives itself.
 
-        `stage` is the name that the stage gives itself.
+        Return whether somebody else has begun to move, command or report an axis; all then stops until `arm`.
         """
-        self.ownership.stage.hear(stage, now_ns)
+        if stage is not None:
+            self.ownership.stage.hear(stage, now_ns)
         for name, voltage in zip(names, voltages, strict=False):
             axis = self.messages.by_name.get(name)
             if axis:
                 axis.amplifier.report(voltage, now_ns)
-        return self.judge(now_ns)
-
-    def judge(self, now_ns: int) -> bool:
-        """Return whether somebody else has begun to move, command or report an axis; all then stops until `arm`."""
         if not self.ownership.lost(now_ns):
             return False
         self.stop(StopReason.LOST, now_ns)

@@ -28,6 +28,7 @@ class Listening(Rule):
 
     def __init__(self, others: Callable[[], Sequence[str]]) -> None:
         self.playing = False  # a driver plays a block
+        self.thorough = False  # nothing moves before the middleware has found everybody, on a busy machine too
         self._others = others
         self._beside: Sequence[str] = ()  # the others at the last look
         self._begun_ns = self._state_ns = 0  # the first `begin`, and when the stage was heard first
@@ -73,12 +74,12 @@ class Listening(Rule):
         return self._finding(f"{named} commands the stage too; end it, then call ~/arm")
 
     def found_all(self, now_ns: int) -> bool:
-        """Return whether the middleware has had the time to find everybody, on a busy machine too."""
+        """Return whether the middleware has had the time to find everybody."""
         return now_ns - self._begun_ns >= LOOK_WITHOUT_NS
 
     def looks(self, now_ns: int) -> bool:
         """Return whether the others have had the time to be known."""
-        return graph_known(now_ns, self._begun_ns, self._state_ns)
+        return self.found_all(now_ns) if self.thorough else graph_known(now_ns, self._begun_ns, self._state_ns)
 
     @staticmethod
     def _finding(reason: str) -> Finding:

@@ -83,9 +83,12 @@ class Memory:
         if controller.model is None or not idle or not unsure:
             return
         resets, ownership = self._reporter.settings.values["reset_on_start"], controller.ownership
-        # As soon as the voltages are known; nobody waits for a reset, so that it is begun when all others are found.
-        alone = ownership.listening is None or ownership.listening.found_all(time.monotonic_ns())
-        self.waits = ownership.obstacle is not None or (resets and not alone)
+        if resets and ownership.listening:
+            # It goes over the whole range: first everybody is found.
+            ownership.listening.thorough = True
+            controller.locate(time.monotonic_ns())
+        # As soon as the voltages are known.
+        self.waits = ownership.obstacle is not None
         if self.waits:
             return
         if resets:

@@ -59,7 +59,6 @@ class Axis:
         self.tracking = TrackingStatistics()  # measured - desired displacement
         self.path = PathWatch()  # desired displacements against the record of the model
         self.surroundings: dict[str, float] = {}  # values of quantities in use
-        self._replaced = False  # a new model, for which the voltage of the last sample is not known yet
         self.uncertainty = Uncertainty()  # of where the axis is, while somebody asks for it
 
     # State
@@ -125,7 +124,6 @@ class Axis:
         self.confidence = self.confidence.over(model.hysteresis_range)
         seconds = sum(effect.settling_time for effect in model.effects)
         self.amplifier.window_ns = BAND_NS + int(seconds * SECOND_NS)
-        self._replaced = True
         self.loop.use(model, allowed, stream, self.samples.given_ns)
         self.surround(self.surroundings)
 
@@ -303,14 +301,10 @@ class Axis:
         self._sample(self.samples.step(now_ns), self.tracking.desired, now_ns)
 
     def approach(self, now_ns: int) -> None:
-        """Go on towards the voltage of the last setpoint."""
-        dt, desired, (low, high) = self.samples.step(now_ns), self.tracking.desired, self.stream.accepted
-        if self._replaced and desired is not None and low <= desired <= high:
-            self._sample(dt, desired, now_ns)
-        else:
-            y = self.stream.desired if desired is None else desired
-            v = self._output(dt, y, self.stream.approach(dt, now_ns), now_ns)
-            self.uncertainty.sample(dt, self.expected, v)
+        """Go on towards the last setpoint, as fast as the limits allow."""
+        desired, (low, high) = self.tracking.desired, self.stream.accepted
+        y = self.setpoint if desired is None or not low <= desired <= high else desired
+        self._sample(self.samples.step(now_ns), y, now_ns)
 
     def drive(self, voltage: float, now_ns: int) -> None:
         """Let memory and effects follow a voltage (V) of a motion without setpoints, which `output` has made."""
@@ -332,7 +326,7 @@ class Axis:
     def _sample(self, dt: float, y: float, now_ns: int) -> float:
         """Output and return the voltage (V) for the desired displacement `y` (m), `dt` (s) after the last step."""
         v = self._output(dt, y, self.stream.move(dt, y, now_ns), now_ns)
-        self.initial.assumed, self._replaced = None, False
+        self.initial.assumed = None
         if self.loop.closed:
             self.loop.setpoint(y, now_ns)
         if self.uncertainty.on:

@@ -32,7 +32,6 @@ class StreamState:
 
     memory: MemoryState
     voltage: float  # V, present command
-    goal: float  # V, required by the last desired displacement
     desired: float  # m, last setpoint of the hysteresis
     displacement: float  # m, of the axis without cross-coupling
     effects: Mapping[str, Any] = field(default_factory=dict)  # states by name
@@ -82,7 +81,7 @@ class StreamingInverse:
         for streaming in self._behind.values():
             streaming.start(y)
             y = streaming.forward(0.0, y)
-        self._command = self.goal = memory.voltage
+        self._command = memory.voltage
         self.desired = memory.displacement
         # Shortfall of the last sample: of the hysteresis or the voltage (m or V), and of the axis as a whole (m).
         self._missing = self._short = 0.0
@@ -269,22 +268,6 @@ class StreamingInverse:
         above = (missing > self._rounding) & (v >= upper - ROUNDING * (1.0 + abs(upper)))
         return np.asarray(above | ((missing < -self._rounding) & (v <= lower + ROUNDING * (1.0 + abs(lower)))))
 
-    def approach(self, dt: float, now_ns: int) -> float:
-        """Go on, `dt` (s) later, towards `goal`, which rate limits have held back; return the voltage (V)."""
-        if not self._before and self.pace.limits.acceleration == inf:
-            # The limits held back the displacement of the hysteresis, of which the voltage follows.
-            self._command = self._move(dt, dt, self.desired, now_ns)
-            if not self._direct:
-                self._follow(dt)
-            return self._command
-        desired, goal = self.desired, self.goal
-        v = self.pace.step(goal, now_ns)
-        self.drive(v, dt)
-        self.desired, self.goal = desired, goal
-        if abs(goal - v) > ROUNDING * (1.0 + abs(goal)):
-            self._missing = goal - v
-        return v
-
     def drive(self, voltage: float, dt: float = 0.0) -> float:
         """Apply a voltage (V), `dt` (s) after the last sample, without a setpoint; return where the stage is (m)."""
         if voltage != self.pace.voltage:
@@ -299,7 +282,7 @@ class StreamingInverse:
 
     def _apply(self, dt: float, voltage: float) -> None:
         """Let memory and effects follow a voltage (V), `dt` (s) after the last sample."""
-        self._command = self.goal = voltage
+        self._command = voltage
         self.memory.forward(self._reaching(dt, voltage))
         self.desired, self._missing = self._inside, 0.0
         self._follow(dt)
@@ -309,7 +292,6 @@ class StreamingInverse:
         return StreamState(
             self.memory.snapshot(),
             self.voltage,
-            self.goal,
             self.desired,
             self.uncoupled_displacement,
             {name: each.snapshot() for name, each in self._streaming.items()},
@@ -318,7 +300,7 @@ class StreamingInverse:
     def restore(self, state: StreamState) -> None:
         """Restore a state from `snapshot`."""
         self.memory.restore(state.memory)
-        self._command, self.goal = state.voltage, state.goal
+        self._command = state.voltage
         self.desired, self._displacement = state.desired, state.displacement
         for name, streaming in self._streaming.items():
             streaming.restore(state.effects[name])
@@ -327,7 +309,7 @@ class StreamingInverse:
 
     def resume(self, before: "StreamingInverse") -> None:
         """Continue from the inverse of another model: same voltage, and the state of the effects that it also has."""
-        self._command = self.goal = before.voltage
+        self._command = before.voltage
         if self._around and before._around and self._around_name == before._around_name:
             self._around.resume(before._around, before.voltage)
         # The command is set without elapsed time.
@@ -368,7 +350,7 @@ class StreamingInverse:
         memory, pace, around = self.memory, self.pace, self._around
         if not self._before and pace.limits.acceleration == inf:
             reach = pace.reach(now_ns)
-            v = self.goal = pace.move(self._invert(elapsed, h, *reach), now_ns, reach)
+            v = pace.move(self._invert(elapsed, h, *reach), now_ns, reach)
             self._missing = self._beyond_rounding(h)
             return v
         state, felt, limits = memory.snapshot(), around.snapshot() if around else None, pace.limits
@@ -379,7 +361,6 @@ class StreamingInverse:
         v = reached = pace.step(goal, now_ns)
         if not self._missing and abs(goal - v) > ROUNDING * (1.0 + abs(goal)):
             self._missing = goal - v
-        self.goal = goal
         for streaming in self._before.values():
             reached = streaming.forward(dt, reached)
         if reached != inside:

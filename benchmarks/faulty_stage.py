@@ -23,6 +23,8 @@ class FaultyStage:
     ----------
     node : rclpy.node.Node
         Node that publishes and subscribes.
+    frame_id : str
+        Name of the stage.
 
     Attributes
     ----------
@@ -32,8 +34,8 @@ class FaultyStage:
         Voltages (V) and their arrival (s, monotonic).
     """
 
-    def __init__(self, node: Any) -> None:
-        self.fault = ""
+    def __init__(self, node: Any, frame_id: str = "") -> None:
+        self.fault, self._frame_id = "", frame_id
         self.commands: list[float] = []
         self.times: list[float] = []
         self._node, self._rng = node, np.random.default_rng(0)
@@ -58,6 +60,7 @@ class FaultyStage:
         y = {"nan": math.nan, "absurd": 3.0, "frozen": 1e-6, "flipped": -y, "moved": y + 1e-3}.get(self.fault, y)
         reported = {"wild": 500.0, "effort 0": 0.0}.get(self.fault, v)
         state = JointState(name=["x"], position=[y], effort=[reported])
+        state.header.frame_id = self._frame_id
         state.header.stamp = self._node.get_clock().now().to_msg()
         state.header.stamp.sec += 3600 if self.fault == "clock" else 0
         self._publisher.publish(state)

@@ -57,7 +57,7 @@ def _reserved(besides: str) -> int:
         domain = DOMAINS[(os.getpid() + turn) % len(DOMAINS)]
         if str(domain) == besides:
             continue
-        lock = open(Path(tempfile.gettempdir()) / f"slpi_ros_domain_{os.getuid()}_{domain}.lock", "w")  # noqa: SIM115
+        lock = open(Path(tempfile.gettempdir()) / f"slpi_ros_test_domain_{os.getuid()}_{domain}.lock", "w")  # noqa: SIM115
         try:
             fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError:

@@ -18,6 +18,8 @@ from std_srvs.srv import Trigger  # noqa: E402
 from benchmarks.faulty_stage import FAULTS, FaultyStage  # noqa: E402
 from slpi_ros.errors import UsageError  # noqa: E402
 from slpi_ros.io.bag_reader import read_bag  # noqa: E402
+from slpi_ros.io.bag_writer import write_bag  # noqa: E402
+from slpi_ros.io.record import Record  # noqa: E402
 from slpi_ros.io.tables import write_table  # noqa: E402
 from slpi_ros.model.document import parse_model  # noqa: E402
 from slpi_ros.nodes.calibration_job import PATH  # noqa: E402
@@ -340,3 +342,20 @@ def test_models_are_verified_on_a_desired_path(tmp_path):
     model = parse_model((out / "model.json").read_text(), "model.json").axes["x"]
     assert model.voltage_range == pytest.approx((0.0, 100.0), abs=1.0)
     assert "the desired path" in (out / "report.html").read_text()
+
+
+@pytest.mark.ros
+@pytest.mark.parametrize(("accepted", "code"), [("", 1), ("theirs", None)])
+def test_bags_of_another_stage_are_not_gone_on_with(tmp_path, accepted, code):
+    t = np.arange(300, dtype=np.int64) * 10_000_000
+    kept = Record(t, {"x": np.linspace(0.0, 10.0, t.size)}, {"x": np.linspace(0.0, 1e-6, t.size)}, hardware_id="theirs")
+    write_bag(tmp_path / "out" / "09_kept", kept)
+    given = {**PARAMETERS, "output": str(tmp_path / "out"), "resume": True, "accept_stage": accepted}
+    with on_graph() as graph, started("calibrator", given) as node:
+        stage = FaultyStage(graph.node, frame_id="mine")
+        if code is None:
+            checked(graph, node, stage)
+        else:
+            assert ended(graph, node) == code
+            assert not stage.commands
+            assert "'theirs'" in node.stderr and "'mine'" in node.stderr

@@ -404,3 +404,14 @@ def test_the_slew_limit_is_the_range_in_a_tenth_of_a_second_unless_it_is_said():
     values = {entry.name: entry.default for entry in DECLARATIONS} | LIMITS
     assert ExciterSettings.of(values).limits[0].slew == 1000.0
     assert ExciterSettings.of(values | {"slew_limit": 0.0}).limits[0].slew == math.inf
+
+
+def test_it_drives_nothing_that_two_report():
+    with on_graph() as graph, exciter(graph, **AT_ONCE, autostart=False) as node:
+        listener = Listener(graph)
+        graph.tested = node
+        publish_state(graph, x=0.0)
+        publish_state(graph, x=0.0)
+        call(graph, "start")
+        graph.spin_until(lambda: "two publishers" in node.stderr, "that both are named")
+        assert not listener.commands

@@ -5,17 +5,16 @@ from dataclasses import dataclass, replace
 from functools import cache, cached_property
 
 import numpy as np
-import osqp
 import scipy.linalg
 import scipy.sparse as sp
 import scipy.sparse.linalg
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
-from slpi_ros.errors import IdentificationError
 from slpi_ros.hysteresis.kinds import Hysteresis
 from slpi_ros.identification.bases import Basis
 from slpi_ros.identification.design_matrix import Design, Walk
 from slpi_ros.identification.progress import report_progress
+from slpi_ros.identification.quadratic_program import QuadraticProgram, Solution, cholesky
 from slpi_ros.identification.samples import Samples
 from slpi_ros.model.axis_model import Start
 
@@ -38,47 +37,13 @@ class Fitted:
         return float(np.sqrt(np.nanmean(self.held_out**2)))
 
 
-# Tolerance of the constraints, in units of the scaled problem; far below the least gain.
-TOLERANCE = 1e-7
-# Default number of iterations between convergence checks of OSQP.
-CHECKED_EVERY = 25
-
-
-def solve_qp(
-    matrix: FloatArray,
-    vector: FloatArray,
-    constraints: sp.csr_array,
-    bound: FloatArray,
-    *,
-    least_iterations: int = CHECKED_EVERY,
-) -> FloatArray:
-    """Return the x, (p,), that minimises ``x' M x / 2 - b' x`` subject to ``C x >= bound``; M positive definite."""
-    # `least_iterations` is also the interval of the convergence checks; IdentificationError if it does not converge.
-    free = solve_free(matrix, vector)
-    if np.all(constraints @ free >= bound):
-        return free
-    # No polishing step: it does not improve the solution at this tolerance, and it writes to standard output.
-    solver = osqp.OSQP()
-    solver.setup(
-        sp.csc_matrix(np.triu(matrix)), -vector, sp.csc_matrix(constraints), bound, np.full(bound.size, np.inf),
-        verbose=False, eps_abs=TOLERANCE, eps_rel=TOLERANCE, max_iter=50_000, check_termination=least_iterations,
-    )  # fmt: skip
-    solver.warm_start(x=free)
-    result = solver.solve(raise_error=False)
-    if result.info.status != "solved":
-        raise IdentificationError(
-            f"the quadratic program did not converge (OSQP: {result.info.status}); check the record for gross errors"
-        )
-    solution: FloatArray = result.x
-    return solution
-
-
 def solve_free(matrix: FloatArray, vector: FloatArray) -> FloatArray:
-    """Minimise ``x' M x / 2 - b' x`` without constraints; parameters and errors as in `solve_qp`."""
-    try:
-        solution: FloatArray = scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix), vector)
-    except np.linalg.LinAlgError:
-        raise IdentificationError("the record does not determine the model; cover more of the voltage range") from None
+    """Minimise ``x' M x / 2 - b' x`` without constraints; parameters and errors as in `QuadraticProgram`."""
+    return _solved(cholesky(matrix), vector)
+
+
+def _solved(root: FloatArray, vector: FloatArray) -> FloatArray:
+    solution: FloatArray = scipy.linalg.cho_solve((root, True), vector, check_finite=False)
     return solution
 
 
@@ -155,23 +120,28 @@ class Problem:
         square: float = float(scipy.sparse.linalg.norm(local)) ** 2 / max(local.shape[0], 1)
         return RIDGE * max(1.0, square)
 
-    def solve(self, smoothness: float) -> FloatArray:
-        """Return the parameters, shape (p,), of a fit to all samples in which every branch is monotone."""
-        matrix, vector = self.design.normal_equations(self.y, self.weights)
-        return self.constrained(matrix + self.penalty(smoothness, self.count), vector)
+    @cached_property
+    def equations(self) -> tuple[FloatArray, FloatArray]:
+        """Normal equations of the fitted samples: ``A' W A``, shape (p, p), and ``A' W y``, shape (p,)."""
+        return self.design.normal_equations(self.y, self.weights)
 
-    def constrained(self, matrix: FloatArray, vector: FloatArray) -> FloatArray:
-        """Minimise ``x' M x / 2 - b' x`` subject to monotone branches."""
+    def solve(self, smoothness: float) -> Solution:
+        """Return the fit to all samples in which every branch is monotone."""
+        matrix, vector = self.equations
+        return self.program(matrix + self.penalty(smoothness, self.count)).solve(vector)
+
+    def program(self, matrix: FloatArray) -> QuadraticProgram:
+        """Return the program ``x' M x / 2 - b' x`` subject to monotone branches, for the matrix M, shape (p, p)."""
         constraints, bound = self.basis.monotone(self.gain / self.scale)
         # The displacement at rest of each record is unconstrained.
         shape = (bound.size, matrix.shape[0])
         constraints = sp.csr_array((constraints.data, constraints.indices, constraints.indptr), shape)
-        return solve_qp(matrix, vector, constraints, bound)
+        return QuadraticProgram(matrix, constraints, bound)
 
     def residual(self) -> FloatArray:
         """Return the errors, shape (N,), in units of `scale`, of a quick fit without monotonicity constraints."""
-        matrix, vector = self.design.normal_equations(self.y, self.weights)
-        x = solve_free(matrix + self.penalty(FIRST_SMOOTHNESS, self.count), vector)
+        matrix, vector = self.equations
+        x = self._free(matrix, vector, FIRST_SMOOTHNESS, self.count)
         return self.design.predict(x) - self.y
 
     def reweighted(self) -> "Problem":
@@ -190,50 +160,84 @@ class Problem:
         # The first rise is part of every fit: it occurs only once in a record, so no other part can predict it.
         return blocked_folds((self.weights > 0) & self.judged & ~self.design.walk.first_rise)
 
-    def held_out_errors(self, smoothness: float) -> FloatArray:
-        """Return the held-out error (m) of each sample, shape (N,); NaN for samples that are in every fit."""
-        errors = np.full(self.y.size, np.nan)
-        for fold, chosen in enumerate(self.folds(), 1):
-            report_progress(f"cross-validation, fold {fold} of {FOLDS}")
-            weights = self.weights.copy()
-            weights[chosen] = 0.0
-            part = replace(self, weights=weights)
-            errors[chosen] = (self.design.predict(part.solve(smoothness)) - self.y)[chosen] * self.scale
-        return errors
+    def held_out_errors(self, smoothness: float, whole: Solution) -> FloatArray:
+        """Return the held-out error (m) of each sample, shape (N,); NaN for samples that are in every fit.
 
-    def scores(self, smoothness: Sequence[float]) -> FloatArray:
-        """Return the robust rms held-out error (m) for each smoothness, from fits without monotonicity constraints."""
-        return np.array([self._score(each) for each in smoothness])
+        `whole` is the fit to all samples, near which those to parts of them are sought.
+        """
+        errors = np.full(self.y.size, np.nan)
+        near = whole.multipliers
+        for number, (chosen, own) in enumerate(zip(self.folds(), self._folds, strict=True), 1):
+            report_progress(f"cross-validation, fold {number} of {FOLDS}")
+            matrix, vector = (all_samples - left_out for all_samples, left_out in zip(self.equations, own, strict=True))
+            matrix += self.penalty(smoothness, self.count - chosen.size)
+            x, near = self.program(matrix).solve(vector, near)
+            errors[chosen] = (self.design.predict(x) - self.y)[chosen] * self.scale
+        return errors
 
     def smoothness_near(self, present: float, among: Sequence[float]) -> float:
         """Return a local minimum of the held-out error over ascending roughness weights, searched from `present`."""
-        score = cache(lambda k: self._score(among[k]))
+        score = cache(lambda k: self.score(among[k]))
         best, k = among.index(present), -1
         while best != k:
             k = best
             best = min(range(max(k - 1, 0), min(k + 2, len(among))), key=score)
         return among[best]
 
+    def best_smoothness(self, among: Sequence[float], near: float, below: float = np.inf) -> tuple[float, float]:
+        """Return the roughness weight with the lowest `score` and that score (m); (`near`, `below`) if none is lower.
+
+        Those next to the weight `near` are tried first: their scores tell that others need not be computed.
+        """
+        best, start = near, among.index(near)
+        for smoothness in sorted(among, key=lambda each: abs(among.index(each) - start)):
+            score = self.score(smoothness, below)
+            if score < below:
+                best, below = smoothness, score
+        return best, below
+
+    def score(self, smoothness: float, below: float = np.inf) -> float:
+        """Return the robust rms held-out error (m) of fits without monotonicity constraints.
+
+        It is infinite where it is not less than `below` (m). That is known early: a fit to all samples with the same
+        penalty has a smaller squared error on each fold than the fit to the others.
+        """
+        folds, (matrix, vector) = self.folds(), self.equations
+        judged = np.concatenate(folds)
+        total = float(self.weights[judged].sum())
+        lowest = total * (below / self.scale) ** 2
+        rest = [self.count - chosen.size for chosen in folds]
+        own = np.array([self.weights[chosen] @ self.y[chosen] ** 2 for chosen in folds])
+        if np.isfinite(lowest):
+            x = self._free(matrix, vector, smoothness, min(rest))
+            # The folds differ by a few samples, and so do their penalties.
+            penalty = (x @ vector - x @ matrix @ x) * (np.array(rest) / min(rest) - 1.0)
+            squares = own + [x @ (left_out @ x - 2.0 * target) for left_out, target in self._folds] - penalty
+        else:
+            squares = np.zeros(len(folds))
+        for k in np.argsort(-squares).tolist():
+            if squares.sum() >= lowest:
+                return np.inf
+            left_out, target = self._folds[k]
+            x = self._free(matrix - left_out, vector - target, smoothness, rest[k])
+            squares[k] = own[k] + x @ (left_out @ x - 2.0 * target)
+        return float(np.sqrt(max(squares.sum(), 0.0) / total)) * self.scale
+
+    def _free(self, matrix: FloatArray, vector: FloatArray, smoothness: float, count: float) -> FloatArray:
+        """Solve normal equations with the penalty for `count` samples, without constraints."""
+        whole = self.penalty(smoothness, count)
+        whole += matrix
+        return _solved(cholesky(whole, overwrite=True), vector)
+
     @cached_property
-    def _folds(self) -> list[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray]]:
-        """For each fold: number of its samples, normal equations of all other samples, normal equations of the fold."""
-        matrix, vector = self.design.normal_equations(self.y, self.weights)
+    def _folds(self) -> list[tuple[FloatArray, FloatArray]]:
+        """Normal equations of the samples of each fold."""
         equations = []
         for chosen in self.folds():
-            left_out = np.zeros_like(self.weights)
-            left_out[chosen] = self.weights[chosen]
-            own_matrix, own_vector = self.design.normal_equations(self.y, left_out)
-            equations.append((chosen.size, matrix - own_matrix, vector - own_vector, own_matrix, own_vector))
+            weights = np.zeros_like(self.weights)
+            weights[chosen] = self.weights[chosen]
+            equations.append(self.design.normal_equations(self.y, weights))
         return equations
-
-    def _score(self, smoothness: float) -> float:
-        """Return the robust rms held-out error (m) of fits without monotonicity constraints."""
-        judged = np.concatenate(self.folds())
-        squares, total = float(self.weights[judged] @ self.y[judged] ** 2), float(self.weights[judged].sum())
-        for count, matrix, vector, own_matrix, own_vector in self._folds:
-            x = solve_free(matrix + self.penalty(smoothness, self.count - count), vector)
-            squares += float(x @ own_matrix @ x - 2.0 * (x @ own_vector))
-        return float(np.sqrt(max(squares, 0.0) / total)) * self.scale
 
 
 def blocked_folds(allowed: Mask) -> list[IntArray]:

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -140,9 +141,7 @@ class Problem:
 
     def residual(self) -> FloatArray:
         """Return the errors, shape (N,), in units of `scale`, of a quick fit without monotonicity constraints."""
-        matrix, vector = self.equations
-        x = self._free(matrix, vector, FIRST_SMOOTHNESS, self.count)
-        return self.design.predict(x) - self.y
+        return self.design.predict(self._free(FIRST_SMOOTHNESS, self.count)) - self.y
 
     def reweighted(self) -> "Problem":
         """Return the problem with reduced weights of outliers (Huber)."""
@@ -155,10 +154,17 @@ class Problem:
             problem = replace(self, weights=weights)
         return problem
 
-    def folds(self) -> list[IntArray]:
-        """Return the sample indices of each fold."""
+    @cached_property
+    def folds(self) -> list["Fold"]:
+        """Parts of the fitted samples, each of which is left out of one fit of a cross-validation."""
         # The first rise is part of every fit: it occurs only once in a record, so no other part can predict it.
-        return blocked_folds((self.weights > 0) & self.judged & ~self.design.walk.first_rise)
+        folds = []
+        for chosen in blocked_folds((self.weights > 0) & self.judged & ~self.design.walk.first_rise):
+            weights = np.zeros_like(self.weights)
+            weights[chosen] = self.weights[chosen]
+            square = float(weights[chosen] @ self.y[chosen] ** 2)
+            folds.append(Fold(chosen, square, *self.design.normal_equations(self.y, weights)))
+        return folds
 
     def held_out_errors(self, smoothness: float, whole: Solution) -> FloatArray:
         """Return the held-out error (m) of each sample, shape (N,); NaN for samples that are in every fit.
@@ -166,13 +172,12 @@ class Problem:
         `whole` is the fit to all samples, near which those to parts of them are sought.
         """
         errors = np.full(self.y.size, np.nan)
-        near = whole.multipliers
-        for number, (chosen, own) in enumerate(zip(self.folds(), self._folds, strict=True), 1):
+        (matrix, vector), near = self.equations, whole.multipliers
+        for number, fold in enumerate(self.folds, 1):
             report_progress(f"cross-validation, fold {number} of {FOLDS}")
-            matrix, vector = (all_samples - left_out for all_samples, left_out in zip(self.equations, own, strict=True))
-            matrix += self.penalty(smoothness, self.count - chosen.size)
-            x, near = self.program(matrix).solve(vector, near)
-            errors[chosen] = (self.design.predict(x) - self.y)[chosen] * self.scale
+            rest = matrix - fold.matrix + self.penalty(smoothness, self.count - fold.chosen.size)
+            x, near = self.program(rest).solve(vector - fold.vector, near)
+            errors[fold.chosen] = (self.design.predict(x) - self.y)[fold.chosen] * self.scale
         return errors
 
     def smoothness_near(self, present: float, among: Sequence[float]) -> float:
@@ -199,45 +204,46 @@ class Problem:
     def score(self, smoothness: float, below: float = np.inf) -> float:
         """Return the robust rms held-out error (m) of fits without monotonicity constraints.
 
-        It is infinite where it is not less than `below` (m). That is known early: a fit to all samples with the same
-        penalty has a smaller squared error on each fold than the fit to the others.
+        It may be infinite where it is not less than `below` (m), which is known early: a fit to all samples with the
+        same penalty has a smaller squared error on each fold than the fit to the others.
         """
-        folds, (matrix, vector) = self.folds(), self.equations
-        judged = np.concatenate(folds)
-        total = float(self.weights[judged].sum())
-        lowest = total * (below / self.scale) ** 2
-        rest = [self.count - chosen.size for chosen in folds]
-        own = np.array([self.weights[chosen] @ self.y[chosen] ** 2 for chosen in folds])
+        counts = np.array([self.count - fold.chosen.size for fold in self.folds])
+        total = float(self.weights[np.concatenate([fold.chosen for fold in self.folds])].sum())
+        lowest, squares = total * (below / self.scale) ** 2, np.zeros(len(self.folds))
         if np.isfinite(lowest):
-            x = self._free(matrix, vector, smoothness, min(rest))
+            least, (matrix, vector) = int(counts.min()), self.equations
+            x = self._free(smoothness, least)
             # The folds differ by a few samples, and so do their penalties.
-            penalty = (x @ vector - x @ matrix @ x) * (np.array(rest) / min(rest) - 1.0)
-            squares = own + [x @ (left_out @ x - 2.0 * target) for left_out, target in self._folds] - penalty
-        else:
-            squares = np.zeros(len(folds))
+            penalty = (x @ vector - x @ matrix @ x) * (counts / least - 1.0)
+            squares = np.array([fold.error(x) for fold in self.folds]) - penalty
         for k in np.argsort(-squares).tolist():
             if squares.sum() >= lowest:
                 return np.inf
-            left_out, target = self._folds[k]
-            x = self._free(matrix - left_out, vector - target, smoothness, rest[k])
-            squares[k] = own[k] + x @ (left_out @ x - 2.0 * target)
+            squares[k] = self.folds[k].error(self._free(smoothness, int(counts[k]), self.folds[k]))
         return float(np.sqrt(max(squares.sum(), 0.0) / total)) * self.scale
 
-    def _free(self, matrix: FloatArray, vector: FloatArray, smoothness: float, count: float) -> FloatArray:
-        """Solve normal equations with the penalty for `count` samples, without constraints."""
+    def _free(self, smoothness: float, count: int, without: "Fold | None" = None) -> FloatArray:
+        """Return the fit without constraints, and `without` a fold, with the penalty for `count` samples."""
+        matrix, vector = self.equations
         whole = self.penalty(smoothness, count)
         whole += matrix
+        if without:
+            whole -= without.matrix
+            vector = vector - without.vector
         return _solved(cholesky(whole, overwrite=True), vector)
 
-    @cached_property
-    def _folds(self) -> list[tuple[FloatArray, FloatArray]]:
-        """Normal equations of the samples of each fold."""
-        equations = []
-        for chosen in self.folds():
-            weights = np.zeros_like(self.weights)
-            weights[chosen] = self.weights[chosen]
-            equations.append(self.design.normal_equations(self.y, weights))
-        return equations
+
+class Fold(NamedTuple):
+    """Samples that are left out of a fit, and what they contribute to the normal equations."""
+
+    chosen: IntArray  # indices
+    square: float  # weighted sum of squared displacements, in units of the problem
+    matrix: FloatArray  # (p, p)
+    vector: FloatArray  # (p,)
+
+    def error(self, x: FloatArray) -> float:
+        """Return the weighted squared error of parameters x, shape (p,), on these samples."""
+        return float(self.square + x @ (self.matrix @ x - 2.0 * self.vector))
 
 
 def blocked_folds(allowed: Mask) -> list[IntArray]:

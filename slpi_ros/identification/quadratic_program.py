@@ -40,6 +40,7 @@ class QuadraticProgram:
 
     def __init__(self, matrix: FloatArray, constraints: sp.csr_array, bound: FloatArray) -> None:
         self._matrix, self._constraints, self._bound = matrix, constraints, bound
+        self._turned = sp.csr_array(constraints.T)
         self._sizes = float(np.abs(matrix).sum(axis=0).max()), abs(constraints)
         self._root = cholesky(matrix)
         # Rows of C root^-T, scaled to unit norm, as far as they were needed, and their norms.
@@ -57,9 +58,9 @@ class QuadraticProgram:
     def _from(self, vector: FloatArray, multipliers: FloatArray) -> Solution | None:
         """Return the solution, sought from `multipliers`, shape (m,); None if it is not found in `ROUNDS`."""
         constraints, (norm, sizes) = self._constraints, self._sizes
-        x = self._moved(vector + constraints.T @ multipliers)
+        x = self._moved(vector + self._turned @ multipliers)
         for _ in range(ROUNDS):
-            gradient = vector + constraints.T @ multipliers - self._matrix @ x
+            gradient = vector + self._turned @ multipliers - self._matrix @ x
             gap = self._bound - constraints @ x
             held = multipliers > 0.0
             feasible = FEASIBLE * float(np.max(sizes @ np.abs(x) + np.abs(self._bound)))

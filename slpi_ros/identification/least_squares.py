@@ -29,8 +29,13 @@ class Fitted:
     y: FloatArray  # m, fitted samples
     voltage_range: tuple[float, float]  # V, of the fitted samples
     errors: FloatArray
-    held_out: FloatArray  # of every sample, (N,); NaN for those in every fit
     covered: float  # share of the parameters or loops that the samples determine
+    validate: Callable[[], FloatArray]  # computes the held-out errors
+
+    @cached_property
+    def held_out(self) -> FloatArray:
+        """Held-out error of every sample, shape (N,), metres; NaN for those in every fit."""
+        return self.validate()
 
     @property
     def held_out_rms(self) -> float:
@@ -133,11 +138,14 @@ class Problem:
 
     def program(self, matrix: FloatArray) -> QuadraticProgram:
         """Return the program ``x' M x / 2 - b' x`` subject to monotone branches, for the matrix M, shape (p, p)."""
+        return QuadraticProgram(matrix, *self._monotone)
+
+    @cached_property
+    def _monotone(self) -> tuple[sp.csr_array, FloatArray]:
         constraints, bound = self.basis.monotone(self.gain / self.scale)
         # The displacement at rest of each record is unconstrained.
-        shape = (bound.size, matrix.shape[0])
-        constraints = sp.csr_array((constraints.data, constraints.indices, constraints.indptr), shape)
-        return QuadraticProgram(matrix, constraints, bound)
+        shape = (bound.size, self.rough.shape[0])
+        return sp.csr_array((constraints.data, constraints.indices, constraints.indptr), shape), bound
 
     def residual(self) -> FloatArray:
         """Return the errors, shape (N,), in units of `scale`, of a quick fit without monotonicity constraints."""

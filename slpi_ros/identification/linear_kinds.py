@@ -129,8 +129,8 @@ def _solved(
         y=np.concatenate([part.y[part.fitted] for part in samples]),
         voltage_range=_fitted_range(samples),
         errors=problem.errors(x),
-        held_out=problem.held_out_errors(smoothness, whole)[np.concatenate(recorded)],
         covered=problem.basis.covered(problem.design.local[np.concatenate([part.fitted for part in samples])]),
+        validate=lambda: problem.held_out_errors(smoothness, whole)[np.concatenate(recorded)],
     )
 
 

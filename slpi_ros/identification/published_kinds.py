@@ -90,7 +90,7 @@ def _fit(samples: Samples, *, at_rest: bool) -> Fitted:
         y=samples.y[samples.fitted],
         voltage_range=samples.voltage_range,
         errors=(_predict(loops, offset, samples.v) - samples.y)[samples.fitted],
-        held_out=held_out_errors(samples, samples.fitted & after_first_rise, predict),
+        validate=lambda: held_out_errors(samples, samples.fitted & after_first_rise, predict),
         covered=len(loops.loops) / len(separate(samples.v, dead_band=loops.dead_band).loops),
     )
 
@@ -366,7 +366,7 @@ def fit_amplitude_scaled(records: Sequence[Samples]) -> Fitted:
         y=samples.y[samples.fitted],
         voltage_range=samples.voltage_range,
         errors=(y - samples.y)[samples.fitted],
-        held_out=held_out_errors(samples, samples.fitted, predict),
+        validate=lambda: held_out_errors(samples, samples.fitted, predict),
         covered=problem.basis.covered(problem.design.local[problem.weights > 0]),
     )
 

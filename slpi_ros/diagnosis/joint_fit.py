@@ -588,7 +588,7 @@ class Explanation:
     def hysteresis(self) -> tuple[Hysteresis, tuple[float, ...]]:
         """Return the hysteresis with monotone branches, and its displacement at the start of each record, m."""
         problem = replace(self.joint.problem, y=self.joint.padded(self.target - self.settling))
-        x = problem.solve(self.evidence.smoothness)
+        x = problem.solve(self.evidence.smoothness).x
         h = problem.design.predict(x)[self.evidence.rows] * problem.scale
         starts = tuple(float(h[rows.start]) for rows in self.evidence.slices)
         return problem.basis.shape(x[: problem.basis.size + 1] * problem.scale, problem.gain), starts

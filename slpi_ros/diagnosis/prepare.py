@@ -16,7 +16,7 @@ from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.bases import Basis, SurfaceBasis
 from slpi_ros.identification.drive import Runs
 from slpi_ros.identification.free_run import choose_start
-from slpi_ros.identification.least_squares import Problem, solve_free, walk_of
+from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem, solve_free, walk_of
 from slpi_ros.identification.linear_kinds import SELECTION_SAMPLES, SMOOTHNESS
 from slpi_ros.identification.published_kinds import voltage_dead_band
 from slpi_ros.identification.refit import basis_of
@@ -343,7 +343,7 @@ def _trusted(part: Part, residual: FloatArray, samples: Samples, *, only_after_r
 def _residual(evidence: Evidence) -> FloatArray:
     """Return the residual of a fit of hysteresis without effects, shape (N,), metres."""
     problem = evidence.problem(evidence.v).reweighted()
-    matrix, vector = problem.design.normal_equations(problem.y, problem.weights)
+    matrix, vector = problem.equations
     x = solve_free(matrix + problem.penalty(evidence.smoothness, problem.count), vector)
     return (problem.y - problem.design.predict(x))[evidence.rows] * problem.scale
 
@@ -427,7 +427,7 @@ def _basis(model: AxisModel | None, samples: Sequence[Samples]) -> Basis:
 
 def _smoothness(samples: Sequence[Samples], basis: Basis) -> float:
     problem = Problem.pose(samples, basis).reweighted()
-    return SMOOTHNESS[int(np.argmin(problem.scores(SMOOTHNESS)))]
+    return problem.best_smoothness(SMOOTHNESS, FIRST_SMOOTHNESS)[0]
 
 
 def _outliers(residual: FloatArray, used: Mask) -> Mask:

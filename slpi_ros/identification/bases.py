@@ -13,6 +13,7 @@ from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.hysteresis.kinds import Hysteresis
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.hysteresis.turning_points import worth_compiling
 from slpi_ros.identification.design_matrix import Walk
 
 # Least slope of a branch as a share of the mean gain, so that every branch has an inverse.
@@ -142,6 +143,12 @@ class SurfaceBasis:
 
     def _surface_rows(self, upper: FloatArray, lower: FloatArray, factor: FloatArray) -> sp.csr_array:
         """Return rows of `factor` times the Everett function: bilinear, linear in cells on the diagonal."""
+        if worth_compiling(upper.size):
+            from slpi_ros.identification.compiled_design import surface_rows
+
+            low, step = float(self.grid[0]), float(self.grid[1] - self.grid[0])
+            pointers, indices, values = surface_rows(upper, lower, factor, low, step, self.grid.size)
+            return sp.csr_array((values, indices, pointers), shape=(upper.size, self.size))
         moved = np.flatnonzero(factor)
         (i, p), (j, q), by = self._cell(upper[moved]), self._cell(lower[moved]), factor[moved]
         # In ascending order of the parameters.

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.hysteresis.branches import AT_REST, LONG_FALL, trace
+from slpi_ros.hysteresis.turning_points import worth_compiling
 
 
 @dataclass(frozen=True)
@@ -137,9 +138,16 @@ class Design:
     @classmethod
     def of(cls, walk: Walk, branch_part: sp.csr_array) -> "Design":
         """Return the design matrix of a `branch_part`, shape (N, size), with a column for each displacement at rest."""
-        rows, record = np.flatnonzero(walk.origin < 0), walk.record
-        no_turn = sp.csr_array((np.ones(rows.size), (rows, record[rows])), shape=(walk.v.size, int(record[-1]) + 1))
-        local = sp.csr_array(sp.hstack([branch_part, no_turn], format="csr"))
+        no_turn, record, size = walk.origin < 0, walk.record, branch_part.shape[1]
+        ends = branch_part.indptr[1:][no_turn]
+        local = sp.csr_array(
+            (
+                np.insert(branch_part.data, ends, 1.0),
+                np.insert(branch_part.indices, ends, size + record[no_turn]),
+                branch_part.indptr + np.append(0, np.cumsum(no_turn)).astype(branch_part.indptr.dtype),
+            ),
+            shape=(walk.v.size, size + int(record[-1]) + 1),
+        )
         return cls(local, walk)
 
     def predict(self, x: FloatArray) -> FloatArray:
@@ -152,6 +160,14 @@ class Design:
 
     def normal_equations(self, y: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return ``A' W A``, shape (p, p), and ``A' W y``, shape (p,), for `y` and `weights` of shape (N,)."""
+        if worth_compiling(y.size):
+            from slpi_ros.identification.compiled_design import accumulate
+
+            local, walk, size = self.local, self.walk, self.local.shape[1]
+            half, vector = np.zeros((size, size)), np.zeros(size)
+            accumulate(local.indptr, local.indices, local.data, walk.branch, walk.turns, weights, y, half, vector)
+            half += half.T
+            return half, vector
         chosen = np.flatnonzero(weights)
         rows = self.rows(chosen)
         return rows.gram(weights[chosen]), rows.project(weights[chosen] * y[chosen])

@@ -105,14 +105,20 @@ def identify(
                     warnings.simplefilter("always")
                     fitted = fit(samples)
                 model = _axis_model(kind, fitted, source)
+                # Whether the fit predicts what was left out is asked of the last one only.
                 good = _without_bad_readings(samples, model, fitted.starts) if model.causal else samples
                 if all(after is before for after, before in zip(good, samples, strict=True)):
                     for warning in raised:
                         warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
                 else:
                     # What the first fit warned of may be due to the outliers; the second one warns for itself.
-                    samples, fitted = good, fit(good)
+                    samples = good
+                    # The first one holds the memory of its problem.
+                    del fitted
+                    fitted = fit(samples)
                     model = _axis_model(kind, fitted, source)
+                _require_sense(fitted)
+                model = replace(model, quality=replace(model.quality, held_out_rms=fitted.held_out_rms))
                 if model.causal:
                     # The final state includes the voltage after `stop`.
                     whole = samples[last]
@@ -156,7 +162,9 @@ def fit_of(kind: str, *, loops_at_rest: bool) -> Callable[[Sequence[Samples]], F
 
 
 def _axis_model(kind: str, fitted: Fitted, source: str) -> AxisModel:
-    _require_sense(fitted)
+    """Return the model of a fit, without its held-out error; IdentificationError if the record determines none."""
+    if fitted.covered == 0.0:
+        raise IdentificationError(NEVER_TURNS)
     y = fitted.y
     return AxisModel(
         kind=kind,
@@ -167,7 +175,7 @@ def _axis_model(kind: str, fitted: Fitted, source: str) -> AxisModel:
         quality=FitQuality(
             rms=float(np.sqrt(np.mean(fitted.errors**2))),
             maximum=float(np.max(np.abs(fitted.errors))),
-            held_out_rms=fitted.held_out_rms,
+            held_out_rms=np.nan,
             floor_rms=white_noise(fitted.errors),
             samples=y.size,
             covered=fitted.covered,
@@ -177,9 +185,7 @@ def _axis_model(kind: str, fitted: Fitted, source: str) -> AxisModel:
 
 
 def _require_sense(fitted: Fitted) -> None:
-    """Raise IdentificationError if the record does not determine a model, or voltage does not explain displacement."""
-    if fitted.covered == 0.0:
-        raise IdentificationError(NEVER_TURNS)
+    """Raise IdentificationError if voltage does not explain displacement."""
     spread = float(np.std(fitted.y))
     if not fitted.held_out_rms <= SENSELESS * spread:
         raise IdentificationError(

@@ -3,19 +3,19 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
+from typing import NamedTuple
 
 import numpy as np
-import osqp
 import scipy.linalg
 import scipy.sparse as sp
 import scipy.sparse.linalg
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
-from slpi_ros.errors import IdentificationError
 from slpi_ros.hysteresis.kinds import Hysteresis
 from slpi_ros.identification.bases import Basis
 from slpi_ros.identification.design_matrix import Design, Walk
 from slpi_ros.identification.progress import report_progress
+from slpi_ros.identification.quadratic_program import QuadraticProgram, Solution, cholesky
 from slpi_ros.identification.samples import Samples
 from slpi_ros.model.axis_model import Start
 
@@ -29,8 +29,13 @@ class Fitted:
     y: FloatArray  # m, fitted samples
     voltage_range: tuple[float, float]  # V, of the fitted samples
     errors: FloatArray
-    held_out: FloatArray  # of every sample, (N,); NaN for those in every fit
     covered: float  # share of the parameters or loops that the samples determine
+    validate: Callable[[], FloatArray]  # computes the held-out errors
+
+    @cached_property
+    def held_out(self) -> FloatArray:
+        """Held-out error of every sample, shape (N,), metres; NaN for those in every fit."""
+        return self.validate()
 
     @property
     def held_out_rms(self) -> float:
@@ -38,47 +43,13 @@ class Fitted:
         return float(np.sqrt(np.nanmean(self.held_out**2)))
 
 
-# Tolerance of the constraints, in units of the scaled problem; far below the least gain.
-TOLERANCE = 1e-7
-# Default number of iterations between convergence checks of OSQP.
-CHECKED_EVERY = 25
-
-
-def solve_qp(
-    matrix: FloatArray,
-    vector: FloatArray,
-    constraints: sp.csr_array,
-    bound: FloatArray,
-    *,
-    least_iterations: int = CHECKED_EVERY,
-) -> FloatArray:
-    """Return the x, (p,), that minimises ``x' M x / 2 - b' x`` subject to ``C x >= bound``; M positive definite."""
-    # `least_iterations` is also the interval of the convergence checks; IdentificationError if it does not converge.
-    free = solve_free(matrix, vector)
-    if np.all(constraints @ free >= bound):
-        return free
-    # No polishing step: it does not improve the solution at this tolerance, and it writes to standard output.
-    solver = osqp.OSQP()
-    solver.setup(
-        sp.csc_matrix(np.triu(matrix)), -vector, sp.csc_matrix(constraints), bound, np.full(bound.size, np.inf),
-        verbose=False, eps_abs=TOLERANCE, eps_rel=TOLERANCE, max_iter=50_000, check_termination=least_iterations,
-    )  # fmt: skip
-    solver.warm_start(x=free)
-    result = solver.solve(raise_error=False)
-    if result.info.status != "solved":
-        raise IdentificationError(
-            f"the quadratic program did not converge (OSQP: {result.info.status}); check the record for gross errors"
-        )
-    solution: FloatArray = result.x
-    return solution
-
-
 def solve_free(matrix: FloatArray, vector: FloatArray) -> FloatArray:
-    """Minimise ``x' M x / 2 - b' x`` without constraints; parameters and errors as in `solve_qp`."""
-    try:
-        solution: FloatArray = scipy.linalg.cho_solve(scipy.linalg.cho_factor(matrix), vector)
-    except np.linalg.LinAlgError:
-        raise IdentificationError("the record does not determine the model; cover more of the voltage range") from None
+    """Minimise ``x' M x / 2 - b' x`` without constraints; parameters and errors as in `QuadraticProgram`."""
+    return _solved(cholesky(matrix), vector)
+
+
+def _solved(root: FloatArray, vector: FloatArray) -> FloatArray:
+    solution: FloatArray = scipy.linalg.cho_solve((root, True), vector, check_finite=False)
     return solution
 
 
@@ -155,24 +126,30 @@ class Problem:
         square: float = float(scipy.sparse.linalg.norm(local)) ** 2 / max(local.shape[0], 1)
         return RIDGE * max(1.0, square)
 
-    def solve(self, smoothness: float) -> FloatArray:
-        """Return the parameters, shape (p,), of a fit to all samples in which every branch is monotone."""
-        matrix, vector = self.design.normal_equations(self.y, self.weights)
-        return self.constrained(matrix + self.penalty(smoothness, self.count), vector)
+    @cached_property
+    def equations(self) -> tuple[FloatArray, FloatArray]:
+        """Normal equations of the fitted samples: ``A' W A``, shape (p, p), and ``A' W y``, shape (p,)."""
+        return self.design.normal_equations(self.y, self.weights)
 
-    def constrained(self, matrix: FloatArray, vector: FloatArray) -> FloatArray:
-        """Minimise ``x' M x / 2 - b' x`` subject to monotone branches."""
+    def solve(self, smoothness: float) -> Solution:
+        """Return the fit to all samples in which every branch is monotone."""
+        matrix, vector = self.equations
+        return self.program(matrix + self.penalty(smoothness, self.count)).solve(vector)
+
+    def program(self, matrix: FloatArray) -> QuadraticProgram:
+        """Return the program ``x' M x / 2 - b' x`` subject to monotone branches, for the matrix M, shape (p, p)."""
+        return QuadraticProgram(matrix, *self._monotone)
+
+    @cached_property
+    def _monotone(self) -> tuple[sp.csr_array, FloatArray]:
         constraints, bound = self.basis.monotone(self.gain / self.scale)
         # The displacement at rest of each record is unconstrained.
-        shape = (bound.size, matrix.shape[0])
-        constraints = sp.csr_array((constraints.data, constraints.indices, constraints.indptr), shape)
-        return solve_qp(matrix, vector, constraints, bound)
+        shape = (bound.size, self.rough.shape[0])
+        return sp.csr_array((constraints.data, constraints.indices, constraints.indptr), shape), bound
 
     def residual(self) -> FloatArray:
         """Return the errors, shape (N,), in units of `scale`, of a quick fit without monotonicity constraints."""
-        matrix, vector = self.design.normal_equations(self.y, self.weights)
-        x = solve_free(matrix + self.penalty(FIRST_SMOOTHNESS, self.count), vector)
-        return self.design.predict(x) - self.y
+        return self.design.predict(self._free(FIRST_SMOOTHNESS, self.count)) - self.y
 
     def reweighted(self) -> "Problem":
         """Return the problem with reduced weights of outliers (Huber)."""
@@ -185,55 +162,96 @@ class Problem:
             problem = replace(self, weights=weights)
         return problem
 
-    def folds(self) -> list[IntArray]:
-        """Return the sample indices of each fold."""
+    @cached_property
+    def folds(self) -> list["Fold"]:
+        """Parts of the fitted samples, each of which is left out of one fit of a cross-validation."""
         # The first rise is part of every fit: it occurs only once in a record, so no other part can predict it.
-        return blocked_folds((self.weights > 0) & self.judged & ~self.design.walk.first_rise)
+        folds = []
+        for chosen in blocked_folds((self.weights > 0) & self.judged & ~self.design.walk.first_rise):
+            weights = np.zeros_like(self.weights)
+            weights[chosen] = self.weights[chosen]
+            square = float(weights[chosen] @ self.y[chosen] ** 2)
+            folds.append(Fold(chosen, square, *self.design.normal_equations(self.y, weights)))
+        return folds
 
-    def held_out_errors(self, smoothness: float) -> FloatArray:
-        """Return the held-out error (m) of each sample, shape (N,); NaN for samples that are in every fit."""
+    def held_out_errors(self, smoothness: float, whole: Solution) -> FloatArray:
+        """Return the held-out error (m) of each sample, shape (N,); NaN for samples that are in every fit.
+
+        `whole` is the fit to all samples, near which those to parts of them are sought.
+        """
         errors = np.full(self.y.size, np.nan)
-        for fold, chosen in enumerate(self.folds(), 1):
-            report_progress(f"cross-validation, fold {fold} of {FOLDS}")
-            weights = self.weights.copy()
-            weights[chosen] = 0.0
-            part = replace(self, weights=weights)
-            errors[chosen] = (self.design.predict(part.solve(smoothness)) - self.y)[chosen] * self.scale
+        (matrix, vector), near = self.equations, whole.multipliers
+        for number, fold in enumerate(self.folds, 1):
+            report_progress(f"cross-validation, fold {number} of {FOLDS}")
+            rest = matrix - fold.matrix + self.penalty(smoothness, self.count - fold.chosen.size)
+            x, near = self.program(rest).solve(vector - fold.vector, near)
+            errors[fold.chosen] = (self.design.predict(x) - self.y)[fold.chosen] * self.scale
         return errors
-
-    def scores(self, smoothness: Sequence[float]) -> FloatArray:
-        """Return the robust rms held-out error (m) for each smoothness, from fits without monotonicity constraints."""
-        return np.array([self._score(each) for each in smoothness])
 
     def smoothness_near(self, present: float, among: Sequence[float]) -> float:
         """Return a local minimum of the held-out error over ascending roughness weights, searched from `present`."""
-        score = cache(lambda k: self._score(among[k]))
+        score = cache(lambda k: self.score(among[k]))
         best, k = among.index(present), -1
         while best != k:
             k = best
             best = min(range(max(k - 1, 0), min(k + 2, len(among))), key=score)
         return among[best]
 
-    @cached_property
-    def _folds(self) -> list[tuple[int, FloatArray, FloatArray, FloatArray, FloatArray]]:
-        """For each fold: number of its samples, normal equations of all other samples, normal equations of the fold."""
-        matrix, vector = self.design.normal_equations(self.y, self.weights)
-        equations = []
-        for chosen in self.folds():
-            left_out = np.zeros_like(self.weights)
-            left_out[chosen] = self.weights[chosen]
-            own_matrix, own_vector = self.design.normal_equations(self.y, left_out)
-            equations.append((chosen.size, matrix - own_matrix, vector - own_vector, own_matrix, own_vector))
-        return equations
+    def best_smoothness(self, among: Sequence[float], near: float, below: float = np.inf) -> tuple[float, float]:
+        """Return the roughness weight with the lowest `score` and that score (m); (`near`, `below`) if none is lower.
 
-    def _score(self, smoothness: float) -> float:
-        """Return the robust rms held-out error (m) of fits without monotonicity constraints."""
-        judged = np.concatenate(self.folds())
-        squares, total = float(self.weights[judged] @ self.y[judged] ** 2), float(self.weights[judged].sum())
-        for count, matrix, vector, own_matrix, own_vector in self._folds:
-            x = solve_free(matrix + self.penalty(smoothness, self.count - count), vector)
-            squares += float(x @ own_matrix @ x - 2.0 * (x @ own_vector))
-        return float(np.sqrt(max(squares, 0.0) / total)) * self.scale
+        Those next to the weight `near` are tried first: their scores tell that others need not be computed.
+        """
+        best, start = near, among.index(near)
+        for smoothness in sorted(among, key=lambda each: abs(among.index(each) - start)):
+            score = self.score(smoothness, below)
+            if score < below:
+                best, below = smoothness, score
+        return best, below
+
+    def score(self, smoothness: float, below: float = np.inf) -> float:
+        """Return the robust rms held-out error (m) of fits without monotonicity constraints.
+
+        It may be infinite where it is not less than `below` (m), which is known early: a fit to all samples with the
+        same penalty has a smaller squared error on each fold than the fit to the others.
+        """
+        counts = np.array([self.count - fold.chosen.size for fold in self.folds])
+        total = float(self.weights[np.concatenate([fold.chosen for fold in self.folds])].sum())
+        lowest, squares = total * (below / self.scale) ** 2, np.zeros(len(self.folds))
+        if np.isfinite(lowest):
+            least, (matrix, vector) = int(counts.min()), self.equations
+            x = self._free(smoothness, least)
+            # The folds differ by a few samples, and so do their penalties.
+            penalty = (x @ vector - x @ matrix @ x) * (counts / least - 1.0)
+            squares = np.array([fold.error(x) for fold in self.folds]) - penalty
+        for k in np.argsort(-squares).tolist():
+            if squares.sum() >= lowest:
+                return np.inf
+            squares[k] = self.folds[k].error(self._free(smoothness, int(counts[k]), self.folds[k]))
+        return float(np.sqrt(max(squares.sum(), 0.0) / total)) * self.scale
+
+    def _free(self, smoothness: float, count: int, without: "Fold | None" = None) -> FloatArray:
+        """Return the fit without constraints, and `without` a fold, with the penalty for `count` samples."""
+        matrix, vector = self.equations
+        whole = self.penalty(smoothness, count)
+        whole += matrix
+        if without:
+            whole -= without.matrix
+            vector = vector - without.vector
+        return _solved(cholesky(whole, overwrite=True), vector)
+
+
+class Fold(NamedTuple):
+    """Samples that are left out of a fit, and what they contribute to the normal equations."""
+
+    chosen: IntArray  # indices
+    square: float  # weighted sum of squared displacements, in units of the problem
+    matrix: FloatArray  # (p, p)
+    vector: FloatArray  # (p,)
+
+    def error(self, x: FloatArray) -> float:
+        """Return the weighted squared error of parameters x, shape (p,), on these samples."""
+        return float(self.square + x @ (self.matrix @ x - 2.0 * self.vector))
 
 
 def blocked_folds(allowed: Mask) -> list[IntArray]:

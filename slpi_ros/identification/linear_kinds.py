@@ -1,7 +1,7 @@
 """Convex fits of the kinds that are linear in their parameters; cross-validation selects grid and smoothness."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -66,23 +66,24 @@ def fit_linear(
 ) -> Fitted:
     """Fit the basis, the simplest first, and the roughness weight with the lowest held-out error."""
     # `share`, 0..1, is a factor on `SELECTION_SAMPLES` and `FIT_SAMPLES`.
-    chosen = choose(samples, bases, smoothness, share=share)
-    warn_of_rest(samples, chosen.beginnings)
+    problem, weight, beginnings = choose(samples, bases, smoothness, share=share)
+    warn_of_rest(samples, beginnings)
     fitted = [
         beginning.of(part.thinned(round(share * FIT_SAMPLES / len(samples))))
-        for beginning, part in zip(chosen.beginnings, samples, strict=True)
+        for beginning, part in zip(beginnings, samples, strict=True)
     ]
-    problem = chosen.problem
     if sum(part.v.size for part in fitted) > problem.y.size:
-        problem = Problem.pose(fitted, problem.basis).reweighted()
-    result = _solved(fitted, problem, chosen.smoothness, chosen.beginnings)
+        # The problem of the choice is released before that of the fit needs its memory.
+        basis = problem.basis
+        del problem
+        problem = Problem.pose(fitted, basis).reweighted()
+    result = _solved(fitted, problem, weight, beginnings)
     judged = problem.judged[problem.weights > 0]
     warn_of_initial_history(result.errors[~judged], result.errors[judged])
     return result
 
 
-@dataclass(frozen=True)
-class Choice:
+class Choice(NamedTuple):
     """Problem (of thinned records), roughness weight and initial states with the lowest held-out error."""
 
     problem: Problem
@@ -98,15 +99,15 @@ def choose(
     report_progress("choosing the initial state")
     beginnings = [choose_start(part, lambda candidate: Problem.pose([candidate], bases[0])) for part in thin]
     thin = [beginning.of(part) for beginning, part in zip(beginnings, thin, strict=True)]
-    candidates = []
+    chosen, best, lowest = None, FIRST_SMOOTHNESS if FIRST_SMOOTHNESS in smoothness else smoothness[0], np.inf
     for number, basis in enumerate(bases, 1):
         report_progress(f"choosing grid and smoothness, {number} of {len(bases)}")
         problem = Problem.pose(thin, basis).reweighted()
-        scores = problem.scores(smoothness)
-        k = int(np.argmin(scores))
-        candidates.append((float(scores[k]), smoothness[k], problem))
-    _, best, problem = min(candidates, key=lambda candidate: candidate[0])
-    return Choice(problem, best, beginnings)
+        better, score = problem.best_smoothness(smoothness, best, lowest)
+        if chosen is None or score < lowest:
+            chosen, best, lowest = problem, better, score
+    assert chosen is not None
+    return Choice(chosen, best, beginnings)
 
 
 def _solved(
@@ -114,7 +115,8 @@ def _solved(
 ) -> Fitted:
     """Solve a problem whose samples begin with the initial state; return the result without that history."""
     report_progress(f"fit to {problem.count} samples")
-    x = problem.solve(smoothness)
+    whole = problem.solve(smoothness)
+    x = whole.x
     predicted = np.split(problem.design.predict(x) * problem.scale, np.cumsum([part.v.size for part in samples])[:-1])
     recorded, starts = [], []
     for part, beginning, y in zip(samples, beginnings, predicted, strict=True):
@@ -127,8 +129,8 @@ def _solved(
         y=np.concatenate([part.y[part.fitted] for part in samples]),
         voltage_range=_fitted_range(samples),
         errors=problem.errors(x),
-        held_out=problem.held_out_errors(smoothness)[np.concatenate(recorded)],
         covered=problem.basis.covered(problem.design.local[np.concatenate([part.fitted for part in samples])]),
+        validate=lambda: problem.held_out_errors(smoothness, whole)[np.concatenate(recorded)],
     )
 
 

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 import scipy.sparse as sp
 from numpy.typing import ArrayLike
-from scipy.optimize import least_squares
 
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import IdentificationError, UsageError
@@ -32,7 +31,8 @@ from slpi_ros.hysteresis.slpi_published import (
 )
 from slpi_ros.identification.bases import LEAST_GAIN, OperatorWeights, banded
 from slpi_ros.identification.design_matrix import Walk
-from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, RIDGE, Fitted, Problem, held_out_errors, solve_qp
+from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, RIDGE, Fitted, Problem, held_out_errors
+from slpi_ros.identification.quadratic_program import QuadraticProgram
 from slpi_ros.identification.samples import FEWEST, NEVER_TURNS, Samples, only_one
 from slpi_ros.model.axis_model import Start
 
@@ -75,11 +75,6 @@ def voltage_dead_band(v: FloatArray) -> float:
     return min(NOISE_PEAK_TO_PEAK * noise, LARGEST_DEAD_BAND * float(np.ptp(v)))
 
 
-def least_iterations(samples: int, all_samples: int) -> int:
-    """Return the least number of iterations for a loop with `samples` of `all_samples` samples, Eq. 9, rounded up."""
-    return int(np.ceil(10.0 * np.sqrt(4.0 * samples / all_samples + 1.0)))
-
-
 def _fit(samples: Samples, *, at_rest: bool) -> Fitted:
     def predict(kept: Mask) -> FloatArray:
         return _predict(*fit_loops(samples, kept, at_rest=at_rest), samples.v)
@@ -95,7 +90,7 @@ def _fit(samples: Samples, *, at_rest: bool) -> Fitted:
         y=samples.y[samples.fitted],
         voltage_range=samples.voltage_range,
         errors=(_predict(loops, offset, samples.v) - samples.y)[samples.fitted],
-        held_out=held_out_errors(samples, samples.fitted & after_first_rise, predict),
+        validate=lambda: held_out_errors(samples, samples.fitted & after_first_rise, predict),
         covered=len(loops.loops) / len(separate(samples.v, dead_band=loops.dead_band).loops),
     )
 
@@ -164,11 +159,10 @@ def fit_plays(
     run_in: float | None,
     *,
     through_zero: bool,
-    iterations: int,
 ) -> Plays:
     """Fit a PI model (Eq. 8) by a quadratic program: least squares, no weight negative, the first one positive."""
     # `drive` (V) and `y` (m), shape (m,), are relative to the vertex of the loop. If `through_zero`, the displacement
-    # there is 0, otherwise it is a parameter of the fit; `iterations` is the minimum number, see `least_iterations`.
+    # there is 0, otherwise it is a parameter of the fit.
     plays = [at_vertex(play(r), run_in).forward_array(drive)[used] for r in thresholds.tolist()]
     design = np.column_stack(plays if through_zero else [*plays, np.ones(np.count_nonzero(used))])
     scale = float(np.ptp(y[used])) or 1.0
@@ -178,7 +172,7 @@ def fit_plays(
     bound[0] = LEAST_GAIN / float(np.ptp(drive))
     not_negative = banded((1.0,), bound.size, matrix.shape[0])
     vector = design.T @ y[used] / scale
-    x = scale * solve_qp(matrix, vector, not_negative, bound, least_iterations=iterations)
+    x = scale * QuadraticProgram(matrix, not_negative, bound).solve(vector).x
     weights = np.maximum(x[: bound.size], 0.0)
     rms = float(np.sqrt(np.mean((design @ x - y[used]) ** 2)))
     return Plays(weights, 0.0 if through_zero else float(x[-1]), run_in, rms)
@@ -196,7 +190,6 @@ class _SingleLoopFit:
         self._used = fitted[path]
         # A measured vertex is fixed; otherwise its displacement is a parameter of the fit.
         self._vertex_known = bool(fitted[loop.vertex])
-        self._iterations = least_iterations(self._v.size, samples.v.size)
 
     def solve(self, run_in: float | None) -> Plays:
         """Fit the loop's operators from the initial state `run_in` (V)."""
@@ -207,7 +200,6 @@ class _SingleLoopFit:
             self._thresholds,
             run_in,
             through_zero=self._vertex_known,
-            iterations=self._iterations,
         )
 
     def loop(self, solution: Plays, below: SingleLoop | None) -> SingleLoop:
@@ -330,6 +322,8 @@ class PeakFrequency:
 
 def fit_peak_frequency(frequency: ArrayLike, peak: ArrayLike) -> PeakFrequency:
     """Fit ``X_p = a f^b`` to peak displacements (m) at frequencies (Hz), (n,) each, by nonlinear least squares."""
+    from scipy.optimize import least_squares
+
     f, x = np.asarray(frequency, dtype=np.float64), np.asarray(peak, dtype=np.float64)
     if f.ndim != 1 or f.shape != x.shape or np.unique(f).size < 2:
         raise IdentificationError(
@@ -372,7 +366,7 @@ def fit_amplitude_scaled(records: Sequence[Samples]) -> Fitted:
         y=samples.y[samples.fitted],
         voltage_range=samples.voltage_range,
         errors=(y - samples.y)[samples.fitted],
-        held_out=held_out_errors(samples, samples.fitted, predict),
+        validate=lambda: held_out_errors(samples, samples.fitted, predict),
         covered=problem.basis.covered(problem.design.local[problem.weights > 0]),
     )
 
@@ -394,7 +388,7 @@ def _fit_scaled(samples: Samples, kept: Mask, largest: Mask) -> tuple[AmplitudeS
     """Return the model fitted to the samples `kept`, and the initial displacement (m)."""
     part = replace(samples, fitted=kept & largest)
     problem = Problem.pose([part], MultiSlopeBasis.over(*_ends(samples)))
-    x = problem.solve(FIRST_SMOOTHNESS) * problem.scale
+    x = problem.solve(FIRST_SMOOTHNESS).x * problem.scale
     base = problem.basis.shape(x, problem.gain)
     assert isinstance(base, MultiSlope)
     # From all fitted samples, not only those kept: the peaks are few.

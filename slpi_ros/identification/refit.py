@@ -251,7 +251,7 @@ def basis_of(axis: AxisModel) -> tuple[Basis, FloatArray]:
 def _solved(problem: Problem, x_old: FloatArray, gain_spread: float = 0.0, shape_spread: float = 0.0) -> FloatArray:
     """Return parameters and displacement at rest of a fit with prior `x_old`, in units of the problem's scale."""
     # If `shape_spread` is zero, `x_old` is kept and only the displacement at rest is fitted.
-    matrix, vector = problem.design.normal_equations(problem.y, problem.weights)
+    matrix, vector = problem.equations
     size = x_old.size
     if not shape_spread:
         at_rest = (vector[size:] - matrix[size:, :size] @ x_old) / np.diag(matrix)[size:]
@@ -261,7 +261,7 @@ def _solved(problem: Problem, x_old: FloatArray, gain_spread: float = 0.0, shape
     prior = np.zeros_like(matrix)
     prior[:size, :size] = _precision(problem.rough[:size, :size], x_old, gain_spread, shape_spread)
     old = np.append(x_old, np.zeros(matrix.shape[0] - size))
-    return problem.constrained(matrix + noise**2 * prior, vector + noise**2 * (prior @ old))
+    return problem.program(matrix + noise**2 * prior).solve(vector + noise**2 * (prior @ old)).x
 
 
 def _precision(rough: FloatArray, x_old: FloatArray, gain_spread: float, shape_spread: float) -> FloatArray:

@@ -149,6 +149,15 @@ class Samples:
 
 def select_samples(record: Record, axis: str, start: float | None, stop: float | None) -> Samples:
     """Select the samples of one axis for a fit, ``start <= t < stop`` (s), preceded by all earlier voltages."""
+    # A record is assessed before it is fitted.
+    key = select_samples, axis, start, stop
+    if key not in record.derived:
+        record.derived[key] = _selected(record, axis, start, stop)
+    samples: Samples = record.derived[key]
+    return samples
+
+
+def _selected(record: Record, axis: str, start: float | None, stop: float | None) -> Samples:
     record.require_axis(axis)
     _require_order(record)
     # Stamps are ordered, so the selection is a slice and long records are not copied.
@@ -171,9 +180,12 @@ def select_thinned(
     # A record longer than `WINDOW` is examined in windows, which need little memory, each with noise of its own.
     if len(record) <= WINDOW:
         samples = select_samples(record, axis, start, stop)
-        kept = samples.thinning(most)
         # `samples` excludes those without a voltage and those after `stop`.
-        return samples.at(kept), np.flatnonzero(np.isfinite(record.voltage[axis]))[: samples.v.size][kept]
+        at = np.flatnonzero(np.isfinite(record.voltage[axis]))[: samples.v.size]
+        if samples.v.size <= most:
+            return samples, at
+        kept = samples.thinning(most)
+        return samples.at(kept), at[kept]
     record.require_axis(axis)
     _require_order(record)
     stamps, origin = record.time_ns, int(record.time_ns[0])

@@ -164,12 +164,12 @@ def without_noise(t: FloatArray, v: FloatArray) -> FloatArray:
     """Return a voltage, shape (N,), volts, with measurement noise removed; a commanded voltage is unchanged."""
     # Each reading is replaced by a parabola over the largest window that fits within the noise. Remaining reversals
     # within the noise are flattened.
-    # SciPy's signal package takes a second to load, and most commands do not need it.
-    from scipy.signal import savgol_filter
-
     noise = voltage_noise(t, v)
     if not noise:
         return v
+    # SciPy's signal package takes half a second to load, and a commanded voltage does not need it.
+    from scipy.signal import savgol_filter
+
     smooth = v
     for window in _WINDOWS:
         if window > v.size:

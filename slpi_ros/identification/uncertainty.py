@@ -74,7 +74,7 @@ def curve_uncertainty(
         solutions = _solutions(problem, chosen.smoothness, resamples)
         paths = np.array([problem.design.predict(x) for x in solutions])[:, problem.weights > 0] * problem.scale
         curves = np.array([_branches(loop, x, problem) for x in solutions])
-        rising, falling = _branches(loop, problem.solve(chosen.smoothness), problem)
+        rising, falling = _branches(loop, problem.solve(chosen.smoothness).x, problem)
     spread = paths.std(axis=0, ddof=1)
     rising_std, falling_std = curves.std(axis=0, ddof=1)
     return CurveUncertainty(
@@ -101,11 +101,11 @@ def _solutions(problem: Problem, smoothness: float, resamples: int) -> list[Floa
     """Return the parameters of fits to the model's prediction plus held-out errors with random signs per block."""
     rng = np.random.default_rng(0)
     design, weights = problem.design, problem.weights
-    matrix, _ = design.normal_equations(problem.y, weights)
-    matrix += problem.penalty(smoothness, problem.count)
-    predicted = design.predict(problem.solve(smoothness))
+    program = problem.program(problem.equations[0] + problem.penalty(smoothness, problem.count))
+    whole = program.solve(problem.equations[1])
+    predicted = design.predict(whole.x)
     rows = design.rows(np.arange(problem.y.size))
-    left_out = problem.held_out_errors(smoothness) / problem.scale
+    left_out = problem.held_out_errors(smoothness, whole) / problem.scale
     errors = np.where(np.isfinite(left_out), left_out, predicted - problem.y)
     blocks = np.array_split(np.arange(problem.y.size), BLOCKS)
     solutions = []
@@ -113,7 +113,7 @@ def _solutions(problem: Problem, smoothness: float, resamples: int) -> list[Floa
         report_progress(f"fits to other errors, {number + 1} of {resamples}")
         sign = np.repeat(rng.choice((-1.0, 1.0), BLOCKS), [block.size for block in blocks])
         drawn = weights * (predicted + sign * errors)
-        solutions.append(problem.constrained(matrix, rows.project(drawn)))
+        solutions.append(program.solve(rows.project(drawn), whole.multipliers).x)
     return solutions
 
 

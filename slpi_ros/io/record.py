@@ -3,8 +3,9 @@
 import mmap
 import os
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Hashable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 from weakref import WeakSet
 
@@ -161,6 +162,11 @@ class Record:
     def t(self) -> FloatArray:
         """Time since the first stamp, shape (N,), seconds."""
         return (self.time_ns - self.time_ns[0]) * 1e-9 if self.time_ns.size else np.empty(0)
+
+    @cached_property
+    def derived(self) -> dict[Hashable, Any]:
+        """Results that are needed again, kept with the record by those who compute them."""
+        return {}
 
     def part(self, rows: slice) -> "Record":
         """Return the record of some samples."""

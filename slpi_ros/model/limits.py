@@ -26,7 +26,7 @@ class Limits:
     mean_rate: float = inf  # V/s, mean of |dV/dt| over 10 s; inf: no limit
 
     def __post_init__(self) -> None:
-        if not self.lower <= self.upper or not min(self.slew, self.acceleration, self.mean_rate) > 0:
+        if not self.lower <= self.upper or not all(rate > 0 for rate in (self.slew, self.acceleration, self.mean_rate)):
             raise UsageError(
                 f"voltage limits {self.lower:g}..{self.upper:g} V with slew {self.slew:g} V/s, acceleration "
                 f"{self.acceleration:g} V/s^2 and mean rate {self.mean_rate:g} V/s are not valid; give lower <= upper, "

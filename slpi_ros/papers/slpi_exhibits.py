@@ -8,7 +8,6 @@ from matplotlib.figure import Figure
 from slpi_ros.arrays import FloatArray
 from slpi_ros.hysteresis.slpi_published import Loop, SeparatedLoops, Separation
 from slpi_ros.identification.linear_kinds import PLAY_OPERATORS
-from slpi_ros.identification.published_kinds import least_iterations
 from slpi_ros.papers.exhibit import Exhibit, Picture, Table, label_axes, outer_legend, panels, um
 from slpi_ros.papers.slpi_study import (
     AT_REST,
@@ -256,6 +255,11 @@ def _weights(models: Mapping[str, SeparatedLoops], level: int, printed: tuple[fl
     return Table((f"level {ROMAN[level]}: r (V)", "ω, paper", *(f"ω, {name} (µm/V)" for name in models)), tuple(rows))
 
 
+def least_iterations(samples: int, all_samples: int) -> int:
+    """Return the least number of iterations for a loop with `samples` of `all_samples` samples, Eq. 9, rounded up."""
+    return int(np.ceil(10.0 * np.sqrt(4.0 * samples / all_samples + 1.0)))
+
+
 def _single_models(study: Study) -> Exhibit:
     models = {AT_REST: study.at_rest, CLOSING: study.closing}
     all_samples = study.separation.voltage.size
@@ -266,8 +270,8 @@ def _single_models(study: Study) -> Exhibit:
     return Exhibit(
         title="Fig. 10 and Tables 2 to 4: a PI model for each loop",
         paper="Every single loop is fitted closely by play operators of its own; the weights have no unit.",
-        ours=f"{len(THRESHOLDS)} operators each, by quadratic programming with at least as many iterations as Eq. 9 "
-        f"asks: {bounds}.",
+        ours=f"{len(THRESHOLDS)} operators each, by quadratic programming to the minimum; Eq. 9 would ask for at "
+        f"least so many iterations: {bounds}.",
         remark="The weights are those of another stage. The inner loops are fitted closely; the outer one, which is "
         "not symmetric, is not.",
         tables=tuple(_weights(models, level, printed) for level, printed in PRINTED.items()),

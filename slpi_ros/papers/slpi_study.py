@@ -21,7 +21,7 @@ from slpi_ros.hysteresis.slpi_published import (
 from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.identification.fit import identify
 from slpi_ros.identification.linear_kinds import PLAY_OPERATORS
-from slpi_ros.identification.published_kinds import default_thresholds, fit_plays, least_iterations
+from slpi_ros.identification.published_kinds import default_thresholds, fit_plays
 from slpi_ros.io.record import Record
 from slpi_ros.simulation.stage import flexure_axis
 
@@ -193,9 +193,7 @@ def classical_model(v: FloatArray, y: FloatArray) -> PrandtlIshlinskii:
     """Fit the classical PI model of Table 5: with its thresholds, and at rest and zero at the start of the record."""
     thresholds = default_thresholds(float(np.ptp(v)))
     everything = np.ones(v.size, dtype=bool)
-    fit = fit_plays(
-        v - v[0], y - y[0], everything, thresholds, None, through_zero=True, iterations=least_iterations(v.size, v.size)
-    )
+    fit = fit_plays(v - v[0], y - y[0], everything, thresholds, None, through_zero=True)
     return PrandtlIshlinskii(thresholds, fit.weights)
 
 

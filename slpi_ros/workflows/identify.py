@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from slpi_ros.diagnosis.diagnose import following
 from slpi_ros.identification import fit
 from slpi_ros.identification.cross_validation import CrossValidationReport, cross_validate
 from slpi_ros.identification.uncertainty import CurveUncertainty, curve_uncertainty, require_known_uncertainty
@@ -85,6 +84,9 @@ def identify(request: IdentifyRequest) -> IdentifyOutcome:
     )
     unmoved: Sequence[str] = ()
     if source.surroundings:
+        # The diagnosis takes a fifth of a second to load.
+        from slpi_ros.diagnosis.diagnose import following
+
         require_causes(records, source)
         model, unmoved = following(records, model, start=source.start, stop=source.stop)
     return IdentifyOutcome(request, model, records, found, unmoved)

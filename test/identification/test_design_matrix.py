@@ -6,6 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from slpi_ros.hysteresis.turning_points import Memory
+from slpi_ros.identification import bases, design_matrix
 from slpi_ros.identification.bases import PlayBasis, SurfaceBasis
 from slpi_ros.identification.design_matrix import Design, Walk
 
@@ -49,17 +50,44 @@ def test_prediction_is_what_the_engine_simulates(kind, primed, seed, corners, be
     np.testing.assert_allclose(predicted, memory.forward_array(v), atol=1e-8)
 
 
-def test_normal_equations_are_those_of_the_full_matrix():
+@pytest.mark.parametrize("compiled", [False, True])
+@pytest.mark.parametrize("kind", BASES)
+@pytest.mark.parametrize("corners", [2, 20, 150])
+def test_normal_equations_are_those_of_the_full_matrix(monkeypatch, compiled, kind, corners):
+    """Of two records, one of which begins after a fall from far above; a quarter of the samples do not count."""
+    for module in (bases, design_matrix):
+        monkeypatch.setattr(module, "worth_compiling", lambda _: compiled)
     rng = np.random.default_rng(3)
-    basis, _ = BASES["slpi"]
-    v = np.interp(np.linspace(0, 19, 300), np.arange(20), rng.uniform(-3, 9, 20))
-    walk = Walk.along(v, symmetric_rest=False, primed=False)
+    basis, _ = BASES[kind]
+    drives = [np.interp(np.linspace(0, corners, 300), np.arange(corners + 1), rng.uniform(-3, 9, corners + 1))] * 2
+    walk = Walk.joined(
+        [
+            Walk.along(v, symmetric_rest=basis.symmetric_rest, primed=primed)
+            for v, primed in zip(drives, (False, True), strict=True)
+        ]
+    )
     design = Design.of(walk, basis.branch_part(walk))
-    full = np.column_stack([design.predict(unit) for unit in np.eye(basis.size + 1)])
-    y, weights = rng.normal(size=v.size), rng.uniform(0, 1, v.size)
+    full = np.column_stack([design.predict(unit) for unit in np.eye(basis.size + 2)])
+    np.testing.assert_array_equal(full[:, -2:], np.eye(2)[walk.record])
+    y, weights = rng.normal(size=600), rng.uniform(0, 1, 600) * (rng.random(600) < 0.75)
     matrix, vector = design.normal_equations(y, weights)
     np.testing.assert_allclose(matrix, full.T * weights @ full, atol=1e-9)
     np.testing.assert_allclose(vector, full.T @ (weights * y), atol=1e-9)
+
+
+@pytest.mark.parametrize("primed", [False, True])
+def test_compiled_rows_are_the_same_to_the_last_bit(monkeypatch, primed):
+    rng = np.random.default_rng(5)
+    basis, _ = BASES["slpi"]
+    # Vertices and reversals within a cell, too.
+    v = np.concatenate([rng.uniform(-3, 9, 300), np.linspace(-3.0, 9.0, 8), rng.uniform(0, 1, 50), [9.0, -3.0]])
+    walk = Walk.along(v, symmetric_rest=False, primed=primed)
+    parts = []
+    for compiled in (False, True):
+        monkeypatch.setattr(bases, "worth_compiling", lambda _, compiled=compiled: compiled)
+        parts.append(basis.branch_part(walk))
+    assert parts[0].nnz == parts[1].nnz
+    np.testing.assert_array_equal(parts[0].toarray(), parts[1].toarray())
 
 
 def test_roughness_vanishes_for_a_classical_pi_surface_with_smooth_branches():

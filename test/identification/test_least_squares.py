@@ -1,53 +1,79 @@
-"""The quadratic program against scipy's solvers."""
+"""The choice of the smoothness by cross-validation, and held-out errors, against fits without any saving."""
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
-import scipy.sparse as sp
-from scipy.optimize import minimize, nnls
+from identification.records import record_of
 
-from slpi_ros.errors import IdentificationError
-from slpi_ros.identification.least_squares import solve_free, solve_qp
+from slpi_ros.excitation.drives import calibration_drive
+from slpi_ros.identification.fit import identify
+from slpi_ros.identification.least_squares import Problem
+from slpi_ros.identification.linear_kinds import SMOOTHNESS, surfaces
+from slpi_ros.identification.samples import select_samples
+from slpi_ros.model.document import format_model
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.parameters import AxisParameters
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_non_negative_least_squares(seed):
+def recorded(seed, lag=0.0, bad=0.0):
     rng = np.random.default_rng(seed)
-    a, y = rng.normal(size=(60, 12)), rng.normal(size=60)
-    x = solve_qp(a.T @ a, a.T @ y, sp.csr_array(np.eye(12)), np.zeros(12))
-    np.testing.assert_allclose(x, nnls(a, y)[0], atol=1e-5)
+    t, v = calibration_drive(0.0, 100.0, duration=15.0, rate=100.0, seed=seed)
+    late = np.interp(t - lag, t, v)
+    y = SimulatedAxis(AxisParameters.random(seed), seed).run(t, late)[1]
+    return record_of(t, v, y + np.where(rng.random(t.size) < bad, rng.normal(0.0, 1e-6, t.size), 0.0))
 
 
-@pytest.mark.parametrize("seed", range(5))
-def test_rising_sequences(seed):
-    rng = np.random.default_rng(seed)
-    a = rng.normal(size=(40, 8))
-    y = a @ np.sort(rng.normal(size=8)) + rng.normal(size=40)
-    rise = sp.csr_array(np.eye(7, 8, 1) - np.eye(7, 8))
-    x = solve_qp(a.T @ a, a.T @ y, rise, np.full(7, 0.1))
-    other = minimize(
-        lambda z: 0.5 * np.sum((a @ z - y) ** 2),
-        np.arange(8.0),
-        jac=lambda z: a.T @ (a @ z - y),
-        method="SLSQP",
-        constraints={"type": "ineq", "fun": lambda z: rise @ z - 0.1, "jac": lambda z: rise.toarray()},
-        options={"ftol": 1e-14, "maxiter": 500},
-    )
-    np.testing.assert_allclose(x, other.x, atol=1e-4)
-    assert np.min(rise @ x) > 0.1 - 1e-6
+def posed(record, grid):
+    samples = select_samples(record, "x", None, None)
+    return Problem.pose([samples], surfaces([samples])[grid]).reweighted()
 
 
-def test_a_free_solution_that_obeys_is_returned_as_it_is():
-    matrix, vector = np.diag([2.0, 4.0]), np.array([2.0, 4.0])
-    x = solve_qp(matrix, vector, sp.csr_array(np.eye(2)), np.zeros(2))
-    np.testing.assert_array_equal(x, solve_free(matrix, vector))
+def held_out(problem, smoothness):
+    """Weighted rms error (m) of fits to all folds but one, without constraints."""
+    total = 0.0
+    for fold in problem.folds:
+        weights = problem.weights.copy()
+        weights[fold.chosen] = 0.0
+        matrix, vector = problem.design.normal_equations(problem.y, weights)
+        x = np.linalg.solve(matrix + problem.penalty(smoothness, np.count_nonzero(weights)), vector)
+        off = (problem.design.predict(x) - problem.y)[fold.chosen]
+        total += problem.weights[fold.chosen] @ off**2
+    chosen = np.concatenate([fold.chosen for fold in problem.folds])
+    return np.sqrt(total / problem.weights[chosen].sum()) * problem.scale
 
 
-def test_contradicting_constraints_are_told():
-    rows = sp.csr_array(np.array([[1.0, 0.0], [-1.0, 0.0]]))
-    with pytest.raises(IdentificationError, match="did not converge"):
-        solve_qp(np.eye(2), np.zeros(2), rows, np.array([1.0, 1.0]))
+@pytest.mark.parametrize(("seed", "lag"), [(0, 0.0), (1, 0.02), (2, 0.2)])
+def test_the_best_smoothness_is_that_of_all_scores(seed, lag):
+    problem = posed(recorded(seed, lag), 0)
+    scores = np.array([held_out(problem, each) for each in SMOOTHNESS])
+    np.testing.assert_allclose([problem.score(each) for each in SMOOTHNESS], scores, rtol=1e-8)
+    best = int(np.argmin(scores))
+    for near in SMOOTHNESS:
+        found, score = problem.best_smoothness(SMOOTHNESS, near)
+        assert (found, score) == (SMOOTHNESS[best], pytest.approx(scores[best], rel=1e-8))
+    for below in scores * 0.9999:
+        found, score = problem.best_smoothness(SMOOTHNESS, 0.1, below)
+        assert (score < below) == (scores[best] < below)
+        # No score below the bound is missed.
+        for each, own in zip(SMOOTHNESS, scores, strict=True):
+            assert (problem.score(each, below) < below) == (own < below)
 
 
-def test_a_singular_problem_is_told():
-    with pytest.raises(IdentificationError, match="does not determine"):
-        solve_free(np.zeros((2, 2)), np.zeros(2))
+def test_held_out_errors_are_those_of_fits_to_the_other_samples():
+    problem = posed(recorded(3, 0.1, 0.03), 0)
+    whole = problem.solve(0.1)
+    assert np.any(whole.multipliers > 0.0), "a lag turns the slope after a reversal"
+    errors = problem.held_out_errors(0.1, whole)
+    for fold in problem.folds:
+        weights = problem.weights.copy()
+        weights[fold.chosen] = 0.0
+        x = replace(problem, weights=weights).solve(0.1).x
+        expected = (problem.design.predict(x) - problem.y)[fold.chosen] * problem.scale
+        np.testing.assert_allclose(errors[fold.chosen], expected, atol=1e-6 * problem.scale)
+
+
+def test_an_identification_that_is_repeated_gives_the_same_document():
+    record = recorded(4, 0.05, 0.03)
+    one, other = (format_model(replace(identify(replace(record)), created="")) for _ in range(2))
+    assert one == other

@@ -11,7 +11,6 @@ from slpi_ros.hysteresis.multi_slope import AmplitudeScaled, MultiSlope, thresho
 from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.identification.design_matrix import Design, Walk
 from slpi_ros.identification.fit import identify
-from slpi_ros.identification.least_squares import solve_qp
 from slpi_ros.identification.published_kinds import (
     MultiSlopeBasis,
     PeakFrequency,
@@ -19,6 +18,7 @@ from slpi_ros.identification.published_kinds import (
     fit_peak_frequency,
     peak_line,
 )
+from slpi_ros.identification.quadratic_program import QuadraticProgram
 
 WEIGHTS = 1e-7 * np.array([5, 0, 1, 2, 0, 0, 1, 0.5, 0, 0, 0, 0.2, 0])
 MODEL = MultiSlope(-5.0, 120.0, thresholds_for(120.0), WEIGHTS)
@@ -57,7 +57,7 @@ def fit(basis, v, y, gain):
     matrix, vector = design.normal_equations(y, np.ones(v.size))
     matrix[np.diag_indices_from(matrix)] += 1e-9 * v.size
     constraints, bound = basis.monotone(gain)
-    return basis.shape(solve_qp(matrix, vector, constraints, bound), gain), design
+    return basis.shape(QuadraticProgram(matrix, constraints, bound).solve(vector).x, gain), design
 
 
 def test_weights_are_found_again():

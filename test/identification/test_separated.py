@@ -11,8 +11,9 @@ from slpi_ros.errors import IdentificationError, UsageError
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop, separate
 from slpi_ros.identification.fit import identify
-from slpi_ros.identification.published_kinds import default_thresholds, least_iterations
+from slpi_ros.identification.published_kinds import default_thresholds
 from slpi_ros.model.document import format_model, parse_model
+from slpi_ros.papers.slpi_exhibits import least_iterations
 from slpi_ros.simulation.axis import SimulatedAxis
 from slpi_ros.simulation.parameters import AxisParameters
 

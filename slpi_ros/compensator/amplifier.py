@@ -224,7 +224,7 @@ class Amplifier(Rule):
             return False
         parts = np.array_split(middles, PARTS)
         went = float(np.ptp([np.median(part) for part in parts]))
-        return went > max(self.tolerance(), *map(np.ptp, parts))
+        return went > max(self.tolerance(), *(float(np.ptp(part)) for part in parts))
 
     def begin(self, voltage: float, now_ns: int) -> None:
         """Continue from a voltage (V) that is known to be there; what was output before no longer counts."""

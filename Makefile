@@ -42,7 +42,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test test-long test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-recorder bench-oscillation bench-export bench-coverage bench-identification test-export-arm FORCE
+.PHONY: help build test test-long test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-recorder bench-oscillation bench-export bench-coverage bench-identification test-export-arm bench-company FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -67,7 +67,8 @@ help:
 	@echo 'make bench-device-lives   calibration, scan and verification through every driver and without one, 24 minutes'
 	@echo 'make bench-surroundings  hidden temperature and load: right topic, gain, decoys, a later day; half an hour'
 	@echo 'make bench-platforms  RECORD=table.csv: the ten commands with the versions of Ubuntu 24.04: the same figures?'
-	@echo 'make bench-restarts   a compensator that is killed and started again: time to its first answer, 10 minutes'
+	@echo 'make bench-restarts   a compensator that is killed and started again: time to its first answer, 10 minutes; RESTARTS="--beside PYTHON"'
+	@echo 'make bench-company    200 lives of nodes beside each other: voltages from what must not move, refusals; half an hour; COMPANY="--lives 60"'
 	@echo 'make bench-soak     10 minutes at 1 kHz, 1 minute at 5 kHz, and the ceiling'
 	@echo 'make bench-trajectory  a trajectory of a million points: acceptance and deadlines'
 	@echo 'make bench-xy       the five segments of the MPI paper through the nodes, with and without feedback'
@@ -194,7 +195,10 @@ bench-surroundings: build
 	$(VENV) benchmarks/surroundings.py
 
 bench-restarts: build
-	$(IN_OWN_DOMAIN) $(VENV) benchmarks/restarts.py
+	$(IN_OWN_DOMAIN) $(VENV) benchmarks/restarts.py $(RESTARTS)
+
+bench-company: build
+	$(IN_OWN_DOMAIN) $(VENV) benchmarks/company.py $(COMPANY)
 
 bench-soak: build
 	$(IN_OWN_DOMAIN) $(VENV) benchmarks/soak.py

@@ -1,7 +1,9 @@
 """Time from the start of a compensator's process to its first answer, by how the life before it ended.
 
-A process that publishes set points at 50 Hz is there all the time. Each life is ended while it follows a trajectory,
-and the next one is started at once. How long it takes is a matter of the middleware: docs/troubleshooting.md.
+A process that publishes set points at 50 Hz, and the state of the stage at 100 Hz, is there all the time. Each life is
+ended while it follows a trajectory, and the next one is started at once. How long it takes is a matter of the
+middleware (docs/troubleshooting.md), and of listening whether somebody else commands the stage. With `--beside` each
+life is followed by one of another environment, in a namespace of its own.
 """
 
 import argparse
@@ -12,7 +14,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -42,21 +44,30 @@ CASES = {
 
 
 class Sender:
-    """The other end: set points at 50 Hz, and the times of the answers."""
+    """The other end: set points at 50 Hz, a stage that does what it is commanded, and the times of the answers."""
 
-    def __init__(self, depth: int) -> None:
+    def __init__(self, depth: int, namespace: str) -> None:
         reliable = QoSProfile(depth=depth, reliability=ReliabilityPolicy.RELIABLE)
-        self.node = rclpy.create_node("sender")
+        self.node = rclpy.create_node("sender", namespace=namespace)
         self.answers: list[float] = []
+        self._state = JointState(name=["x", "y"], position=[0.0, 0.0], effort=[0.0, 0.0])
+        self._state.header.frame_id = "stage"
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self.node.create_subscription(Float64MultiArray, "voltage_command", self._on_answer, reliable)
         self._points = self.node.create_publisher(JointState, "desired_displacement", reliable)
         self._paths = self.node.create_publisher(JointTrajectory, "desired_trajectory", reliable)
+        self._states = self.node.create_publisher(JointState, "stage_state", reliable)
         self.node.create_timer(0.02, self._send)
+        self.node.create_timer(0.01, self._report)
 
-    def _on_answer(self, _: Float64MultiArray) -> None:
+    def _on_answer(self, answer: Float64MultiArray) -> None:
         self.answers.append(time.monotonic())
+        self._state.effort = answer.data
+
+    def _report(self) -> None:
+        self._state.header.stamp = self.node.get_clock().now().to_msg()
+        self._states.publish(self._state)
 
     def _send(self) -> None:
         self._points.publish(JointState(name=["x", "y"], position=[3e-6, 2e-6]))
@@ -71,52 +82,65 @@ class Sender:
         ]
         self._paths.publish(JointTrajectory(joint_names=["x"], points=points))
 
-    def spin(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
-        """Serve callbacks for some time, or until something is true."""
-        end = time.monotonic() + seconds
-        while time.monotonic() < end and not until():
-            self._executor.spin_once(timeout_sec=0.01)
+    def serve(self) -> None:
+        """Serve what is due."""
+        self._executor.spin_once(timeout_sec=0.002)
 
     def close(self) -> None:
         self._executor.shutdown()
         self.node.destroy_node()
 
 
-def first_answers(case: str, lives: int, folder: Path) -> list[float]:
-    """Return the time (s) to the first answer of each life."""
+def spin(senders: Sequence[Sender], seconds: float, until: Callable[[], bool] = lambda: False) -> None:
+    """Serve callbacks for some time, or until something is true."""
+    end = time.monotonic() + seconds
+    while time.monotonic() < end and not until():
+        for sender in senders:
+            sender.serve()
+
+
+def first_answers(case: str, lives: int, folder: Path, pythons: Sequence[str]) -> list[list[float]]:
+    """Return the time (s) to the first answer of each life, for each environment."""
     number, depth, profile = CASES[case]
-    given = {"axes": "['x','y']", "model_file": folder / "model.json", "memory_file": folder / "memory.json"}
-    parameters = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
-    command = [sys.executable, "-m", "slpi_ros.nodes.start", "compensator", "--ros-args", *parameters]
     environment = os.environ | ({"FASTRTPS_DEFAULT_PROFILES_FILE": str(PROFILE)} if profile else {})
-    sender, found = Sender(depth), []
+    senders = [Sender(depth, f"/environment{each}") for each in range(len(pythons))]
+    found: list[list[float]] = [[] for _ in pythons]
     for _ in range(lives):
-        count, begun = len(sender.answers), time.monotonic()
-        node = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
-        try:
-            later = lambda: len(sender.answers) > count and sender.answers[-1] > begun + NOT_YET  # noqa: E731, B023
-            sender.spin(PATIENCE, later)
-            found.append(next((at for at in sender.answers[count:] if at > begun + NOT_YET), np.inf) - begun)
-            sender.spin(random.uniform(0.2, 0.8))
-            sender.send_path()
-            sender.spin(random.uniform(0.6, 2.0))
-        finally:
-            node.send_signal(number)
-            node.wait()
-    sender.close()
+        for each, (python, sender) in enumerate(zip(pythons, senders, strict=True)):
+            memory = folder / f"memory{each}.json"
+            given = {"axes": "['x','y']", "model_file": folder / "model.json", "memory_file": memory}
+            words = [word for name, value in given.items() for word in ("-p", f"{name}:={value}")]
+            words += ["-r", f"__ns:=/environment{each}"]
+            command = [python, "-m", "slpi_ros.nodes.start", "compensator", "--ros-args", *words]
+            count, begun = len(sender.answers), time.monotonic()
+            node = subprocess.Popen(command, env=environment, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+            try:
+                later = lambda: len(sender.answers) > count and sender.answers[-1] > begun + NOT_YET  # noqa: E731, B023
+                spin(senders, PATIENCE, later)
+                found[each].append(next((at for at in sender.answers[count:] if at > begun + NOT_YET), np.inf) - begun)
+                spin(senders, random.uniform(0.2, 0.8))
+                sender.send_path()
+                spin(senders, random.uniform(0.6, 2.0))
+            finally:
+                node.send_signal(number)
+                node.wait()
+    for sender in senders:
+        sender.close()
     return found
 
 
-def main(lives: int = 20) -> None:
-    """Print a line for each case."""
+def main(lives: int = 20, beside: str = "") -> None:
+    """Print a line for each case and environment, and how much later than the other one this environment answers."""
     rclpy.init()
     print(f"load of the machine before: {os.getloadavg()[0]:.2f}; time to the first answer, s")
-    print(f"{'end of the life before':<40} {'lives':>6} {'median':>7} {'longest':>8}")
+    print(f"{'end of the life before':<40} {'lives':>6} {'median':>7} {'longest':>8} {'later':>6}")
+    pythons = [sys.executable, *filter(None, [beside])]
     with tempfile.TemporaryDirectory() as folder:
         save_model(stage(), Path(folder, "model.json"))
         for case in CASES:
-            found = first_answers(case, lives, Path(folder))
-            print(f"{case:<40} {len(found):6d} {np.median(found):7.1f} {max(found):8.1f}", flush=True)
+            for each, found in enumerate(times := first_answers(case, lives, Path(folder), pythons)):
+                name, later = ("beside", "") if each else (case, f"{np.median(found) - np.median(times[-1]):6.1f}")
+                print(f"{name:<40} {len(found):6d} {np.median(found):7.1f} {max(found):8.1f} {later}", flush=True)
             # Those that were killed are forgotten before the next case.
             time.sleep(FORGOTTEN)
     rclpy.try_shutdown()
@@ -125,4 +149,6 @@ def main(lives: int = 20) -> None:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--lives", type=int, default=20)
-    main(parser.parse_args().lives)
+    parser.add_argument("--beside", default="", metavar="PYTHON", help="another environment")
+    options = parser.parse_args()
+    main(options.lives, options.beside)

@@ -25,6 +25,8 @@ TOLERATED_SHARE = 0.02
 FOREIGN_REPORTS, FOREIGN_NS = 3, SECOND_NS // 10
 # Reports are steady if they stay within the tolerance for this time; a rearming node waits longer.
 STEADY_NS, REARM_NS = SECOND_NS // 5, SECOND_NS // 2
+# A motion is seen between this many parts of the last second.
+PARTS = 4
 # Voltages are kept in pieces of this length.
 PIECE_NS = SECOND_NS // 100
 # A gain or an offset of the reports is one that explains this share of them, and of those while the voltage moved;
@@ -214,6 +216,15 @@ class Amplifier(Rule):
             return None
         recent = [v for t, v in self._reports if now_ns - t <= for_ns]
         return self.calibration.voltage(median(recent or [v for _, v in last]))
+
+    def moves(self, now_ns: int) -> bool:
+        """Return whether the reports of the last second went from one voltage to another, by more than they vary."""
+        middles = [0.5 * (low + high) for _, low, high in self._levels.since(now_ns - 2 * REARM_NS)]
+        if len(middles) < PARTS * REPORTS:
+            return False
+        parts = np.array_split(middles, PARTS)
+        went = float(np.ptp([np.median(part) for part in parts]))
+        return went > max(self.tolerance(), *(float(np.ptp(part)) for part in parts))
 
     def begin(self, voltage: float, now_ns: int) -> None:
         """Continue from a voltage (V) that is known to be there; what was output before no longer counts."""

@@ -56,6 +56,9 @@ class Ownership:
 
     def locate(self, now_ns: int) -> None:
         """Move the axes of the model to where their amplifiers are found, once it is known who is there."""
+        if self.listening and any(axis.amplifier.moves(now_ns) for axis in self._axes):
+            # Somebody commands it whom the middleware may not have found yet.
+            self.listening.hear(now_ns)
         if found := self._stranger(now_ns) or (self.listening and self.listening.check(now_ns)):
             self.obstacle = STARTING, str(found)
             return

@@ -49,7 +49,7 @@ class GuardedDrive:
         self._reporters = {axis: SoleReporter(axis, lambda: publishers_beside(node, state)) for axis in self._axes}
         self._identity = Monitor(*self._reporters.values())
         self._probe = StateProbe(node)
-        self._state_ns = 0  # when the first state was heard
+        self._begun_ns, self._state_ns = time.monotonic_ns(), 0  # of the node; when the first state was heard
         self.prepare(values)
 
     def prepare(self, values: Values) -> None:
@@ -105,7 +105,9 @@ class GuardedDrive:
 
     def stranger(self) -> str:
         """Return who else commands or reports the stage, or that it is not known yet; "" if nobody does."""
-        if not graph_known(time.monotonic_ns(), self._since_ns, self._state_ns):
+        now_ns = time.monotonic_ns()
+        # A drive goes over the whole range: it waits until the middleware has found everybody, on a busy machine too.
+        if not (graph_known(now_ns, self._begun_ns, 0) and graph_known(now_ns, self._begun_ns, self._state_ns)):
             return "looking who else is there"
         company = self.company()
         return f"{company}; stop it" if company else self._second_reporter()

@@ -8,6 +8,7 @@ from strategies import FAMILY_CASE, axis_model
 
 from slpi_ros.compensator.amplifier import REARM_NS, Amplifier
 from slpi_ros.compensator.controller import Controller
+from slpi_ros.compensator.listening import Listening
 from slpi_ros.compensator.ownership import MEASURED, SAVED
 from slpi_ros.compensator.persistence import SavedAxis
 from slpi_ros.compensator.validation import NOT_ARMED, STARTING, RejectedError
@@ -321,6 +322,31 @@ def test_noise_of_reports_never_reaches_the_memory():
     turns = owned.made.axes[0].reversal_voltages
     owned.run(2.0, noise=0.5)
     assert owned.made.axes[0].reversal_voltages == turns and owned.made.ownership.armed
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.5])
+def test_a_stage_that_moves_before_the_first_voltage_is_commanded_by_somebody(noise):
+    made = controller()
+    made.ownership.listening = Listening(tuple)
+    made.ownership.listening.begin(START)
+    made.ownership.listening.state(START)
+    for k in range(60):
+        made.report(["x"], [30.0 + 0.2 * k + noise * RNG.normal()], START + 10 * k * MS)
+    assert refused(made, START + 600 * MS) == STARTING
+    # It stays: whoever moved it may begin again for a while.
+    for k in range(60, 360):
+        made.report(["x"], [42.0 + noise * RNG.normal()], START + 10 * k * MS)
+        if k < 200:
+            assert refused(made, START + 10 * k * MS) == STARTING
+    assert abs(send(made, START + 3_600 * MS) - 42.0) <= 3.0 * noise + 0.2 + 1e-9
+
+
+@pytest.mark.parametrize("noise", [0.1, 0.5, 2.0])
+def test_noise_of_the_reports_before_the_first_voltage_is_no_motion(noise):
+    made = controller()
+    for k in range(100):
+        made.report(["x"], [30.0 + noise * RNG.normal()], START + 10 * k * MS)
+        assert not made.axes[0].amplifier.moves(START + 10 * k * MS)
 
 
 @pytest.mark.parametrize("told", [1e3, 1e4, 5e4, 1e5, 9.9e5, -1e3])

@@ -19,6 +19,7 @@ from std_msgs.msg import Float64MultiArray  # noqa: E402
 from std_srvs.srv import Trigger  # noqa: E402
 from trajectory_msgs.msg import JointTrajectory  # noqa: E402
 
+from slpi_ros.compensator.listening import LOOK_WITHOUT_NS  # noqa: E402
 from slpi_ros.errors import UsageError  # noqa: E402
 from slpi_ros.excitation.drives import excite  # noqa: E402
 from slpi_ros.nodes.exciter import DECLARATIONS, ExciterSettings  # noqa: E402
@@ -308,6 +309,16 @@ def test_a_stage_outside_the_limits_is_left_alone():
         said = node.stderr.splitlines()[-1]
     assert said == "exciter: axis 'x' is at 120 V, outside 0 to 100 V; move it inside first"
     assert not listener.commands
+
+
+def test_it_drives_nothing_before_the_middleware_has_had_the_time_to_find_everybody():
+    with on_graph() as graph:
+        listener, begun = Listener(graph), time.monotonic_ns()
+        publish = graph.node.create_publisher(JointState, "stage_state", RELIABLE).publish
+        graph.node.create_timer(0.01, lambda: publish(JointState(name=["x"], position=[0.0], effort=[0.0])))
+        with exciter(graph, **LIMITS, settle=0.0):
+            listener.wait_for(1)
+            assert time.monotonic_ns() - begun >= LOOK_WITHOUT_NS
 
 
 def test_it_drives_nothing_beside_another_publisher():

@@ -3,7 +3,7 @@
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -172,7 +172,7 @@ def _on_displacement(voltage: _Series, displacement: _Series, held: bool) -> _Al
     time = displacement.time[known]
     y = {axis: column[known] for axis, column in displacement.columns.items()}
     if not held:
-        return time, {axis: _between(time, voltage.time, column) for axis, column in voltage.columns.items()}, y
+        return time, {axis: between(time, voltage.time, column) for axis, column in voltage.columns.items()}, y
     current = np.searchsorted(voltage.time, time, side="right") - 1
     unseen = _unseen_turns(voltage, current)
     # Each missing reversal is inserted before the first displacement that is not earlier.
@@ -210,12 +210,12 @@ def _on_voltage(voltage: _Series, displacement: _Series, held: bool) -> _Aligned
     return (
         time,
         {axis: column[known] for axis, column in v.items()},
-        {axis: _between(time, displacement.time, column) for axis, column in displacement.columns.items()},
+        {axis: between(time, displacement.time, column) for axis, column in displacement.columns.items()},
     )
 
 
-def _between(time: IntArray, known_at: IntArray, values: FloatArray) -> FloatArray:
-    """Interpolate linearly; the result is NaN within long gaps."""
+def between(time: NDArray[Any], known_at: NDArray[Any], values: FloatArray) -> FloatArray:
+    """Return values (N,), known at ascending times (N,), at other times (M,): linear between them, NaN in long gaps."""
     start = known_at[0]
     result = np.interp((time - start).astype(np.float64), (known_at - start).astype(np.float64), values)
     steps = np.diff(known_at)

@@ -11,6 +11,7 @@ from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import IdentificationError, length
 from slpi_ros.identification import bad_readings, drive, signal_statistics
 from slpi_ros.identification.drive import SPEED_FACTOR
+from slpi_ros.identification.held_readings import held_readings
 from slpi_ros.identification.samples import NEAR_END, NEVER_TURNS, WINDOW, bounds, select_thinned, windows
 from slpi_ros.io.record import Record, release
 
@@ -55,6 +56,7 @@ class SignalQuality:
     mixed_share: float = 0.0  # of those tested, which are not next to a reversal
     infinite: int = 0
     mixed_size: float = 0.0  # typical largest error: half the change between the neighbours
+    held: float = 1.0  # samples for which each reading is repeated; the other figures are those of fresh readings
 
     @property
     def range(self) -> float:
@@ -165,6 +167,7 @@ def _whole_signal(parts: list[SignalQuality]) -> SignalQuality:
         noise=float(np.median([part.noise for part in parts])),
         digit=float(np.median([part.digit for part in parts])),
         longest_stuck=max(part.longest_stuck for part in parts),
+        held=float(np.median([part.held for part in parts])),
         mixed_share=float(np.mean([part.mixed_share for part in parts])),
         mixed_size=float(np.median(sizes)) if sizes else 0.0,
         **{name: sum(getattr(part, name) for part in parts) for name in counts},
@@ -206,6 +209,8 @@ def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality
     infinite = [int(np.count_nonzero(np.isinf(signal))) for signal in (v, y)]
     if not both.all():
         t, v, y = t[both], v[both], y[both]
+    held = held_readings(y, v)
+    t, v, y = t[held.fresh], v[held.fresh], y[held.fresh]
     far_v, far_y = bad_readings.far_outliers(v, y)
     v, y = bad_readings.without(v, far_v), bad_readings.without(y, far_y)
     gain = signal_statistics.spread(y) / signal_statistics.spread(v)
@@ -224,7 +229,7 @@ def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality
     voltage = _signal(v, missing[0], noise_v, digit_v, stopped, off_v)
     voltage = replace(voltage, spikes=voltage.spikes + np.setdiff1d(far_v, off_v).size, infinite=infinite[0])
     spikes = displacement.spikes + np.setdiff1d(far_y, off_y).size
-    return voltage, replace(displacement, spikes=spikes, infinite=infinite[1])
+    return voltage, replace(displacement, spikes=spikes, infinite=infinite[1], held=held.rows)
 
 
 def _signal(
@@ -315,6 +320,7 @@ def findings(quality: Quality) -> list[Finding]:
     samples = quality.clock.samples
     return [
         *_clock_findings(quality.clock),
+        *_held(quality),
         *_displacement(quality.displacement),
         *_readings("displacement", quality.displacement, samples),
         *_voltage(quality.voltage),
@@ -355,6 +361,15 @@ def _clock_findings(clock: ClockQuality) -> Iterator[Finding]:
         yield Finding("warn", f"{_of(clock.duplicates, clock.samples)} with the stamp of the one before")
 
 
+def _held(quality: Quality) -> Iterator[Finding]:
+    """Say that the sensor is slower than the record."""
+    rows = quality.displacement.held
+    if rows > 1.0 and quality.clock.period:
+        rate = 1.0 / (rows * quality.clock.period)
+        text = f"the sensor is slower than the record: each reading is repeated for {rows:.3g} samples"
+        yield Finding("warn", f"{text}, {rate:.4g} are fresh per second; only these are used")
+
+
 def _displacement(y: SignalQuality) -> Iterator[Finding]:
     scatter = f"{length(y.noise)} rms" if y.noise else "below its digits"
     yield _warn_if(
@@ -387,8 +402,7 @@ def _readings(name: str, signal: SignalQuality, samples: int) -> Iterator[Findin
         yield Finding("warn", f"{text}: what goes further is not seen")
     if stuck := signal.stuck - signal.clipped:
         text = f"{name} stuck for {_of(stuck, samples)}, up to {signal.longest_stuck} in a row"
-        slow = ": the sensor is slower than the record" if stuck > 0.5 * samples else ""
-        yield Finding("warn", f"{text}{slow}; where noise should tell them apart they are not fitted")
+        yield Finding("warn", f"{text}; where noise should tell them apart they are not fitted")
     if signal.mixed:
         text = f"{name} early, late or mixed with the reading beside it in {_of(signal.mixed, samples)}"
         share = f"{100.0 * signal.mixed_share:.2g} % of those not beside a turn"

@@ -18,6 +18,7 @@ from slpi_ros.identification.bad_readings import (
     stuck,
     without,
 )
+from slpi_ros.identification.held_readings import held_readings
 from slpi_ros.identification.signal_statistics import without_noise
 from slpi_ros.io.record import Record, each_block, first_step_back, release
 
@@ -47,6 +48,7 @@ class Samples:
     history: int = 0
     mixed: int = 0  # samples not fitted because they are mixed, see `bad_readings.Mixed`
     side: int = 0  # of the neighbour that they are mixed with
+    held: float = 1.0  # samples for which each reading is repeated; only the fresh ones are fitted
 
     @property
     def primed(self) -> bool:
@@ -99,7 +101,12 @@ class Samples:
         """Return the mask, shape (N,), of the samples that `thinned` keeps."""
         every = max(1, round(self.v.size / most))
         kept = np.zeros(self.v.size, dtype=bool)
-        kept[::every] = True
+        fitted = np.flatnonzero(self.fitted)
+        if 2 * fitted.size < self.v.size:
+            # Of a slow sensor, most samples have no reading of their own.
+            kept[fitted[:: max(1, round(fitted.size / most))]] = True
+        else:
+            kept[::every] = True
         if every > 1:
             # Of equal consecutive samples at a reversal, keep both ends.
             ends = np.array(monotone_runs(self.v)).ravel()
@@ -200,6 +207,7 @@ def select_thinned(
     _require_enough(record, axis, count, start, stop)
     sides = np.array([part.side for part in parts])
     whole = Samples(
+        held=float(np.median([part.held for part in parts])),
         v=np.concatenate([part.v for part in parts]),
         y=np.concatenate([part.y for part in parts]),
         fitted=np.concatenate([part.fitted for part in parts]),
@@ -253,9 +261,12 @@ def _require_enough(record: Record, axis: str, count: int, start: float | None, 
 
 
 def _examined(t: FloatArray, v: FloatArray, y: FloatArray, fitted: Mask, where: str) -> Samples:
-    """Return samples with a finite voltage without outliers, stuck and mixed readings, and noise of the voltage."""
+    """Return samples with a finite voltage without outliers, held, stuck and mixed readings, and voltage noise."""
     # The mask `fitted` has at least `FEWEST` samples and is modified in place. `where` names the record in the error of
     # signals without motion; "" for a part of a record, which is not tested.
+    known = np.flatnonzero(fitted)
+    held = held_readings(y[known], v[known])
+    fitted[known[~held.fresh]] = False
     if not fitted.all():
         y = np.where(fitted, y, 0.0)
     # Outliers of the voltage must not count as reversals or extend the range.
@@ -273,7 +284,7 @@ def _examined(t: FloatArray, v: FloatArray, y: FloatArray, fitted: Mask, where: 
     # If the record has mixed readings, only these are excluded: they look like outliers, too.
     fitted[known[mixed.readings if mixed.side else off_y]] = False
     smooth = without_noise(t, without(v, known[off_v]))
-    return Samples(smooth, y, fitted, mixed=mixed.readings.size, side=mixed.side)
+    return Samples(smooth, y, fitted, mixed=mixed.readings.size, side=mixed.side, held=held.rows)
 
 
 def part_of(t: FloatArray, start: float | None, stop: float | None) -> tuple[int, int]:

@@ -19,6 +19,8 @@ from slpi_ros.io.record import Record, release
 _LOST, _GAP = 1.5, 5.0
 # Samples to which the drive of a record longer than `WINDOW` is thinned, besides its reversals.
 _DRIVE_SAMPLES = 500_000
+# Change of the voltage from reading to reading beside that over two, from which there are two signals.
+_ALTERNATES = 10.0
 # Number of samples within which stamps recover after a late stamp.
 _CATCHES_UP = 51
 
@@ -56,6 +58,7 @@ class SignalQuality:
     mixed_share: float = 0.0  # of those tested, which are not next to a reversal
     infinite: int = 0
     mixed_size: float = 0.0  # typical largest error: half the change between the neighbours
+    alternating: bool = False  # every other reading belongs to another signal
     held: float = 1.0  # samples for which each reading is repeated; the other figures are those of fresh readings
 
     @property
@@ -168,6 +171,7 @@ def _whole_signal(parts: list[SignalQuality]) -> SignalQuality:
         digit=float(np.median([part.digit for part in parts])),
         longest_stuck=max(part.longest_stuck for part in parts),
         held=float(np.median([part.held for part in parts])),
+        alternating=all(part.alternating for part in parts),
         mixed_share=float(np.mean([part.mixed_share for part in parts])),
         mixed_size=float(np.median(sizes)) if sizes else 0.0,
         **{name: sum(getattr(part, name) for part in parts) for name in counts},
@@ -209,6 +213,8 @@ def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality
     infinite = [int(np.count_nonzero(np.isinf(signal))) for signal in (v, y)]
     if not both.all():
         t, v, y = t[both], v[both], y[both]
+    # The voltage returns with every second reading.
+    twice = float(np.median(np.abs(np.diff(v)))) > _ALTERNATES * float(np.median(np.abs(v[2:] - v[:-2])))
     held = held_readings(y, v)
     t, v, y = t[held.fresh], v[held.fresh], y[held.fresh]
     far_v, far_y = bad_readings.far_outliers(v, y)
@@ -227,7 +233,9 @@ def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality
         size, share = float(np.median(ways)), mixed.size / judged
         displacement = replace(displacement, mixed=int(mixed.size), mixed_share=share, mixed_size=size)
     voltage = _signal(v, missing[0], noise_v, digit_v, stopped, off_v)
-    voltage = replace(voltage, spikes=voltage.spikes + np.setdiff1d(far_v, off_v).size, infinite=infinite[0])
+    voltage = replace(
+        voltage, spikes=voltage.spikes + np.setdiff1d(far_v, off_v).size, infinite=infinite[0], alternating=twice
+    )
     spikes = displacement.spikes + np.setdiff1d(far_y, off_y).size
     return voltage, replace(displacement, spikes=spikes, infinite=infinite[1], held=held.rows)
 
@@ -318,6 +326,9 @@ def findings(quality: Quality) -> list[Finding]:
         Findings on stamps, displacement, voltage and excitation, in this order, then the notes of the record.
     """
     samples = quality.clock.samples
+    if quality.voltage.alternating:
+        text = "two publishers in one topic: every other message tells of other voltages"
+        return [Finding("stop", f"{text}; stop one of them, and record again")]
     return [
         *_clock_findings(quality.clock),
         *_held(quality),

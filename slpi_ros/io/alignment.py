@@ -28,7 +28,8 @@ class Signals:
     frame_id: str  # the first that is not empty
     fields: Mapping[str, Mapping[str, FloatArray]]  # ``position``, ``effort``, ``data`` or ``vector``; NaN: not given
     named: bool  # the message type names the columns, otherwise they are ``0``, ``1``, ...
-    note: str = ""  # on the order of the messages, which are sorted
+    notes: tuple[str, ...] = ()  # on messages that were left out, or sorted
+    received: int = 0  # messages, with those that were left out
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -84,7 +85,7 @@ def combine(voltage: Signals, displacement: Signals, topics: SeparateTopics, axe
         source=str(path),
         hardware_id=displacement.frame_id or voltage.frame_id,
         notes=(
-            *dict.fromkeys(filter(None, (voltage.note, displacement.note))),
+            *dict.fromkeys((*voltage.notes, *displacement.notes)),
             *notes,
             *_naming(voltage, topics.voltage, wanted),
             *_naming(displacement, topics.displacement, wanted),

@@ -449,6 +449,9 @@ def _drive_findings(quality: Quality) -> Iterator[Finding]:
                 "again",
             )
             return
+        if sum(drive.holds) > 0.5 * clock.duration:
+            yield Finding("stop", f"{text}, as the voltage jumps from hold to hold: drive ramps, which show the loops")
+            return
         yield Finding("stop", f"{text}: record {rate:.2g} samples per second or more, all of them, or drive slower")
         return
     yield _warn_if(
@@ -457,7 +460,8 @@ def _drive_findings(quality: Quality) -> Iterator[Finding]:
         "loops that begin elsewhere cannot be identified; turn at more voltages",
     )
     yield _memory(drive)
-    yield Finding("ok", _speeds_and_holds(drive))
+    if clock.duplicates <= 0.5 * clock.samples:
+        yield Finding("ok", _speeds_and_holds(drive))
 
 
 def _memory(drive: DriveQuality) -> Finding:

@@ -323,7 +323,20 @@ def _require_motion(v: FloatArray, y: FloatArray, fitted: Mask, where: str) -> N
     if not turns:
         raise IdentificationError(f"{where}: {NEVER_TURNS}")
     if np.corrcoef(v, y)[0, 1] < -CLEARLY:
-        raise RecordError(f"{where}: displacement falls where voltage rises; change the sign of one of them")
+        raise RecordError(
+            f"{where}: {butterfly(v, y) or 'displacement falls where voltage rises; change the sign of one of them'}"
+        )
+
+
+def butterfly(v: FloatArray, y: FloatArray) -> str:
+    """Return what a displacement (m) is that follows both signs of a voltage (V) alike, (N,); "" if it does not."""
+    both = float(v.min()) < 0.0 < float(v.max())
+    if not both or abs(np.corrcoef(np.abs(v), y)[0, 1]) <= abs(np.corrcoef(v, y)[0, 1]):
+        return ""
+    return (
+        "the displacement is V-shaped over the voltage, as of a ferroelectric that a bipolar drive switches: no model "
+        "here describes that; drive within one sign of the voltage"
+    )
 
 
 def only_one(records: Sequence[Samples], kind: str) -> Samples:

@@ -1,5 +1,6 @@
 """Alignment of voltage and displacement from separate topics to one clock."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -15,6 +16,9 @@ from slpi_ros.io.record import Record
 
 # Longest gap, in median periods, across which values are interpolated.
 _GAP = 10.0
+# Blocks of messages by which a drift of two clocks is found, and messages in each; its standard errors, and the share
+# of a sampling period that they are apart in the end, from which it is corrected.
+_BLOCKS, _FEWEST_IN_BLOCKS, _SURE, _APART = 20, 10, 6.0, 0.1
 # Axis names for columns without names.
 _AXES = ("x", "y", "z")
 
@@ -138,7 +142,7 @@ def _times(
         if _overlap(voltage.stamp, displacement.stamp):
             for topic, stamp in ((topics.voltage, voltage.stamp), (topics.displacement, displacement.stamp)):
                 _require_order(stamp, f"{where}: stamps of '{topic}'")
-            return voltage.stamp, displacement.stamp, []
+            return voltage.stamp, *_in_one_clock(voltage, displacement, topics)
         reason = "their header stamps are of different clocks"
     else:
         unstamped = [
@@ -151,6 +155,36 @@ def _times(
         raise RecordError(f"{where}: at no time were both recorded; record them together")
     note = f"aligned by the time of recording ({reason}): late messages are paired with the wrong voltage"
     return voltage.logged, displacement.logged, [note]
+
+
+def _in_one_clock(voltage: Signals, displacement: Signals, topics: SeparateTopics) -> tuple[IntArray, list[str]]:
+    """Return the stamps of the displacement by the clock of those of the voltage, and a note if they drift apart."""
+    # Both were recorded by one clock: each stamp's drift is that against the times of recording.
+    assert voltage.stamp is not None and displacement.stamp is not None
+    driven, uncertain = _rate(voltage.stamp, voltage.logged)
+    moved, also = _rate(displacement.stamp, displacement.logged)
+    rate, error = moved - driven, math.hypot(uncertain, also)
+    time = displacement.stamp - displacement.stamp[0]
+    apart = abs(rate) * float(time[-1])
+    if not (abs(rate) > _SURE * error and apart > _APART * float(np.median(np.diff(displacement.stamp)))):
+        return displacement.stamp, []
+    # The rate of the recorder's clock against that of the voltage is not known better than to itself: it cancels.
+    stamps: IntArray = displacement.stamp - np.rint(time * (rate / (1.0 + rate))).astype(np.int64)
+    how = f"{1e6 * abs(rate):.3g} ppm {'faster' if rate > 0.0 else 'slower'} than that of '{topics.voltage}'"
+    told = f"the clock of '{topics.displacement}' goes {how}, {apart * 1e-9:.3g} s in all: its stamps were corrected"
+    return stamps, [told]
+
+
+def _rate(stamp: IntArray, logged: IntArray) -> tuple[float, float]:
+    """Return the relative rate of the clock of stamps (ns, (N,)) against that of recording, less 1, and its error."""
+    blocks = np.array_split(np.arange(stamp.size), _BLOCKS)
+    if stamp.size < _FEWEST_IN_BLOCKS * _BLOCKS:
+        return 0.0, math.inf
+    since = (logged - logged[0]).astype(np.float64)
+    # Messages come late now and then: medians.
+    at, late = (np.array([np.median(x[block]) for block in blocks]) for x in (since, stamp - stamp[0] - since))
+    (rate, _), covariance = np.polyfit(at / at[-1], late, 1, cov=True)
+    return float(rate / at[-1]), float(np.sqrt(covariance[0, 0]) / at[-1])
 
 
 def _overlap(one: IntArray, other: IntArray) -> bool:

@@ -272,12 +272,13 @@ def _choose_axes(state: Signals, axes: Sequence[str] | None, where: str) -> tupl
     chosen = tuple(axes or state.names)
     for axis in chosen:
         if axis not in state.names:
-            raise RecordError(f"{where}: no axis '{axis}'; there is {names}")
+            raise RecordError(f"{where}: no axis '{axis}'; there is {names} (--axis)")
         for field in ("position", "effort"):
             if all(np.isnan(part).all() for (part,) in each_block(state.fields[field][axis])):
                 raise RecordError(
                     f"{where}: axis '{axis}' has no value in {field}[] of any message; position[] must hold "
-                    f"the measured metres, effort[] the applied volts; else read other axes, of {names}"
+                    f"the measured metres, effort[] the applied volts; else read other axes, of {names} (--axis), or "
+                    "topics of their own (--voltage-topic, --displacement-topic)"
                 )
     return chosen
 

@@ -63,8 +63,9 @@ def in_order(
 
 
 def _usual_step(time: IntArray) -> float:
-    """Return the median of the steps between times, in their unit; the first time if there is one only."""
-    return float(np.median(np.abs(np.diff(time)))) if time.size > 1 else float(time[0])
+    """Return the median of the steps between times that differ, in their unit; the first time if there are none."""
+    steps = np.abs(np.diff(time))
+    return float(np.median(steps[steps > 0])) if steps.any() else float(time[0])
 
 
 def _doubled(time: IntArray, columns: list[NDArray[Any]]) -> Mask:

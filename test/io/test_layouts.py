@@ -6,19 +6,13 @@ import warnings
 
 import numpy as np
 import pytest
+from io_layouts import DSPACE, LABVIEW, RIGOL, ROWS, SIGNALS, STRUCTURE, N, T, V, Y, lines, settings_beside
 from refusals import holds, refusal
 from scipy.io import savemat
 
 from slpi_ros.errors import DependencyError, RecordError, UsageError
 from slpi_ros.io.columns import ColumnOptions
 from slpi_ros.io.tables import import_table, import_with_summary, read_table
-
-N = 60
-T = np.round(np.arange(N) * 0.005, 4)
-V = np.round(50.0 - 50.0 * np.cos(np.arange(N) / 9.0), 4)
-# With hysteresis: no straight line of the voltage.
-Y = np.round(0.2 * V + 1.5 * np.sin(np.arange(N) / 9.0), 4)
-ROWS = list(zip(T.tolist(), V.tolist(), Y.tolist(), strict=True))
 
 
 @pytest.fixture(autouse=True)
@@ -28,41 +22,6 @@ def no_warning():
         yield
 
 
-def lines(separator="\t", *, end="", form="{:.4f}", comma=False, rows=ROWS):
-    text = "".join(separator.join(form.format(x) for x in row) + end + "\n" for row in rows)
-    return text.replace(".", ",") if comma else text
-
-
-LABVIEW = """LabVIEW Measurement\t
-Writer_Version\t2
-Reader_Version\t2
-Separator\tTab
-Decimal_Separator\t{mark}
-Multi_Headings\tNo
-X_Columns\t{columns}
-Time_Pref\tAbsolute
-Operator\tuser
-Date\t2024/03/05
-Time\t10:30:25,201000213623046875
-***End_of_Header***\t
-\t
-Channels\t2\t\t
-Samples\t60\t60\t
-Date\t2024/03/05\t2024/03/05\t
-Time\t10:30:25.375\t10:30:25.375\t
-Y_Unit_Label\tVolts\tVolts\t
-X_Dimension\tTime\tTime\t
-X0\t0.0000000000000000E+0\t0.0000000000000000E+0\t
-Delta_X\t0.005000\t0.005000\t
-***End_of_Header***\t\t\t
-X_Value\tPiezo voltage\tPosition (um)\tComment
-"""
-RIGOL = "X,CH1,CH2,Start,Increment,\nSequence,Volt,Volt,-1.500000e+01,5.000000e-03\n"
-SETTINGS = ("Record Length", "60", "Points"), ("Sample Interval", "0.005", "s"), ("Trigger Point", "30", "Samples")
-BESIDE = "".join(
-    ",".join([*(SETTINGS[k] if k < len(SETTINGS) else ("", "", "")), *(f"{x:.4f}" for x in row)]) + ",\n"
-    for k, row in enumerate(ROWS)
-)
 DATES = "".join(f"2026-01-31 23:59:59.{900 + 5 * k:03d},{v},{y}\n" for k, (_, v, y) in enumerate(ROWS[:20])) + "".join(
     f"2026-02-01 00:00:00.{5 * k:03d},{v},{y}\n" for k, (_, v, y) in enumerate(ROWS[20:])
 )
@@ -79,7 +38,7 @@ TEXTS = {
                  {"time": "x-axis", "voltage": ("1",), "displacement": ("2",), **SCOPE}),
     "Rigol": (RIGOL + lines(",", end=",", rows=[(k, *row[1:]) for k, row in enumerate(ROWS)], form="{}"),
               {"sample_period": 0.005, "voltage": ("CH1",), "displacement": ("CH2",), **SCOPE}),
-    "Tektronix": (BESIDE, {"names": ("time_s", "voltage_V", "position_um")}),
+    "Tektronix": (settings_beside(ROWS), {"names": ("time_s", "voltage_V", "position_um")}),
     "spaces": ("  Time(s)   Voltage(V)   Position(um)\n" + lines("   "), {}),
     "names with spaces": ("Time (s)  Piezo voltage (V)  Position (um)\n" + lines(" "), {}),
     "names with units after spaces": ("Time (s) Voltage (V) Position (um)\n" + lines(" "), {}),
@@ -124,21 +83,6 @@ def test_layouts_of_text(tmp_path, layout):
     agrees(import_with_summary(path, ColumnOptions(**options)).record)
 
 
-STRUCTURE = {
-    "time": T[:, None],
-    "signals": {"values": np.c_[V, Y], "dimensions": 2.0, "label": ""},
-    "blockName": "model/Scope",
-}
-SIGNALS = np.empty((1, 2), object)
-SIGNALS[0] = [{"values": V[:, None], "label": "voltage_V"}, {"values": Y[:, None], "label": "position_um"}]
-DSPACE = {
-    "X": {"Name": "Time", "Data": T[None], "Unit": "s"},
-    "Y": [
-        {"Name": '"Model Root"/"drive"', "Data": V[None], "Unit": "V"},
-        {"Name": "Position", "Data": Y[None], "Unit": "um"},
-    ],
-    "Description": {"General": "capture"},
-}
 BY_PLACE = {"voltage": ("signals.values(:,1)",), "displacement": ("signals.values(:,2)",)}
 MATLAB = {
     "vectors": ({"time_s": T, "x_V": V, "x_um": Y, "note": "run 3"}, {}),

@@ -12,6 +12,7 @@ from slpi_ros.compensator.statistics import Timing
 from slpi_ros.devices.block import BUSY, Blocks
 from slpi_ros.devices.link import State, Status, opened
 from slpi_ros.devices.pace import Pace
+from slpi_ros.devices.recent_readings import RecentReadings
 from slpi_ros.devices.writer import LoopSettings, Writer
 from slpi_ros.drivers.base import Device, DeviceError, Found, Reading
 from slpi_ros.io.messages import SECOND_NS
@@ -61,6 +62,7 @@ class DeviceLoop:
         self.counts, self.timing = LoopCounts(), Timing()
         self.found: Found | None = None
         self.latest: Reading | None = None
+        self.recent = RecentReadings()
         self.answers: deque[tuple[str, bool, str]] = deque()  # request, whether it succeeded, text
         self._device, self._settings, self._on_reading, self._now_ns = device, settings, on_reading, now_ns
         self.status, self._retry_ns = Status(State.OPENING), 0
@@ -148,6 +150,7 @@ class DeviceLoop:
         reading = self._device.exchange(self._next(now_ns))
         self.counts.cycles += 1
         self.latest = reading
+        self.recent.note(reading)
         self._on_reading(reading)
         self.blocks.note(reading)
         if self.status.armed and not self.blocks.by_device and (found := self._writer.compare(reading, now_ns)):

@@ -17,7 +17,7 @@ def _add_options(command: ArgumentParser) -> None:
     common.add_output(command, "BAG", "folder of the new bag")
     command.add_argument(
         "--names", metavar="NAME", nargs="+", default=(),
-        help="names of the columns of a text that has none, or others than it has; of all, or of those that are filled",
+        help="names of the columns of a text, of all or of those that are filled; default: those above the data",
     )  # fmt: skip
     time = command.add_mutually_exclusive_group()
     time.add_argument(
@@ -25,7 +25,7 @@ def _add_options(command: ArgumentParser) -> None:
         help="seconds of any epoch, dates or times of day; default: the column whose name starts with 'time'",
     )  # fmt: skip
     time.add_argument(
-        "--sample-period", metavar="S", type=float, help="seconds from row to row, where there is no column of time"
+        "--sample-period", metavar="S", type=float, help="seconds from row to row; default: the times of the rows"
     )
     command.add_argument(
         "--voltage", metavar="COLUMN", nargs="+", default=(),
@@ -45,11 +45,12 @@ def _add_options(command: ArgumentParser) -> None:
     )
     command.add_argument(
         "--sensor-scale", metavar="M", type=float,
-        help="metres for one unit of the columns of displacement, as of a sensor's monitor in volts",
+        help="metres for one unit of the columns of displacement, as of a monitor in volts; default: by their unit",
     )  # fmt: skip
     command.add_argument(
         "--amplifier-gain", metavar="V/V", type=float,
-        help="volts at the stage for one unit of the columns of voltage, as of an amplifier's input",
+        help="volts at the stage for one unit of the columns of voltage, as of an amplifier's input; default: by their "
+        "unit",
     )  # fmt: skip
     command.add_argument("--sheet", metavar="NAME", help="sheet of a workbook; default: the only one")
     command.add_argument("--group", metavar="NAME", help="group of a TDMS file; default: the only one")

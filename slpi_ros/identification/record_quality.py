@@ -21,6 +21,8 @@ _LOST, _GAP = 1.5, 5.0
 _DRIVE_SAMPLES = 500_000
 # Change of the voltage from reading to reading beside that over two, from which there are two signals.
 _ALTERNATES = 10.0
+# Median change of a voltage from sample to sample, as a share of its range, of one that jumps from turn to turn.
+_JUMPS = 0.01
 # Number of samples within which stamps recover after a late stamp.
 _CATCHES_UP = 51
 
@@ -74,6 +76,7 @@ class DriveQuality:
     turns: int  # reversals
     covered: float  # share of all pairs of last reversal voltage and present voltage that were visited
     samples_per_run: float  # median, between reversals
+    usual_step: float  # median change from sample to sample, share of the range
     speeds: tuple[float, ...]  # V/s, of runs with about equal voltage change, as in `Runs`
     speed_range: tuple[float, float]  # V/s, of the slowest and the fastest run
     holds: tuple[float, ...]  # s
@@ -278,6 +281,7 @@ def _drive(
         turns=runs.turns,
         covered=drive.covered(v, runs),
         samples_per_run=float(np.median(np.diff(at[runs.ends]))),
+        usual_step=float(np.median(np.abs(np.diff(v)))) / float(np.ptp(v)),
         speeds=runs.speeds,
         speed_range=runs.speed_range,
         holds=tuple(drive.holds(t, v, drive.hold_band(v, voltage.noise, voltage.digit)).tolist()),
@@ -449,7 +453,7 @@ def _drive_findings(quality: Quality) -> Iterator[Finding]:
                 "again",
             )
             return
-        if sum(drive.holds) > 0.5 * clock.duration:
+        if drive.usual_step < _JUMPS:
             yield Finding("stop", f"{text}, as the voltage jumps from hold to hold: drive ramps, which show the loops")
             return
         yield Finding("stop", f"{text}: record {rate:.2g} samples per second or more, all of them, or drive slower")

@@ -102,7 +102,7 @@ class Samples:
         every = max(1, round(self.v.size / most))
         kept = np.zeros(self.v.size, dtype=bool)
         fitted = np.flatnonzero(self.fitted)
-        if 2 * fitted.size < self.v.size:
+        if every > 1 and self.held > 1.0:
             # Of a slow sensor, most samples have no reading of their own.
             kept[fitted[:: max(1, round(fitted.size / most))]] = True
         else:

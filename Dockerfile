@@ -12,6 +12,7 @@ RUN apt-get update \
         python3-matplotlib \
         python3-numba \
         python3-numpy \
+        python3-pandas \
         python3-pip \
         python3-scipy \
         python3-threadpoolctl \

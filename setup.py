@@ -6,7 +6,9 @@ from setuptools import find_packages, setup
 
 NAME = "slpi_ros"
 SHARE = f"share/{NAME}"
-FLEET = ["bokeh>=3.1.0", "dask[distributed]>=2024.1.0", "pandas>=2.1.4", "pyarrow>=14.0.1"]
+FLEET = ["bokeh>=3.1.0", "dask[distributed]>=2024.1.0", "pyarrow>=14.0.1"]
+# Files of measured data beside text and MATLAB up to version 7.
+TABLES = ["h5py>=3.10.0", "nptdms>=1.13.0", "openpyxl>=3.1.2"]
 # Of devices, one extra each; PI's GCS over TCP needs none.
 DRIVERS = {
     "labjack": ["pymodbus>=3.16.1"],
@@ -43,6 +45,7 @@ setup(
         "numba>=0.58.1",
         "numpy>=1.26.4,<3",
         "osqp>=1.0.0,<2",
+        "pandas>=2.1.4",
         "rosbags>=0.11.6",
         "scipy>=1.11.4",
         "threadpoolctl>=3.1.0",
@@ -53,9 +56,11 @@ setup(
         "docs": ["furo>=2025.12.19", "myst-parser>=5.2.0", "sphinx>=9.0.4"],
         # bokeh draws Dask's dashboard
         "fleet": FLEET,
+        "tables": TABLES,
         **DRIVERS,
         "test": [
             *FLEET,
+            *TABLES,
             *(package for packages in DRIVERS.values() for package in packages),
             # fmpy, by which units (FMI) are checked, is in requirements/ only: it demands cmake and nbformat, which
             # checking does not need.

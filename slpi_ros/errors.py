@@ -7,20 +7,23 @@ from types import TracebackType
 
 # Characters of a line on a terminal, in a log or on a page; a hostile file may hold names of megabytes.
 LONGEST_SHOWN = 2_000
-_FLEET = "pip install 'dask[distributed]' bokeh pandas pyarrow"
+_FLEET = "pip install 'dask[distributed]' bokeh pyarrow"
 # How to get each package; a test compares the names with setup.py.
 HOW_TO_GET = {
     "bokeh": _FLEET,
     "dask": _FLEET,
     "distributed": _FLEET,
+    "h5py": "apt install python3-h5py, or pip install h5py",
     "jinja2": "apt install python3-jinja2, or pip install jinja2",
     "jsonschema": "apt install python3-jsonschema, or pip install jsonschema",
     "matplotlib": "apt install python3-matplotlib, or pip install matplotlib",
     "nidaqmx": "pip install 'slpi_ros[nidaqmx]', or pip install 'nidaqmx[grpc]'",
+    "nptdms": "pip install nptdms",
     "numba": "apt install python3-numba, or pip install numba",
     "numpy": "apt install python3-numpy, or pip install numpy",
+    "openpyxl": "apt install python3-openpyxl, or pip install openpyxl",
     "osqp": "pip install osqp",
-    "pandas": _FLEET,
+    "pandas": "apt install python3-pandas, or pip install pandas",
     "pyarrow": _FLEET,
     "pymodbus": "pip install 'slpi_ros[labjack]', or pip install pymodbus",
     "serial": "apt install python3-serial, or pip install pyserial",

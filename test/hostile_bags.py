@@ -179,6 +179,41 @@ def second_axis(record, rng):
     return replace(record, voltage=v, displacement={name: signals[name] for name in names})
 
 
+def _rows(record, rows, time_ns=None):
+    return record_of(
+        record.voltage["x"][rows], record.displacement["x"][rows],
+        time_ns=(record.time_ns if time_ns is None else time_ns)[rows],
+    )  # fmt: skip
+
+
+def doubled(record, rng):
+    """Messages that were recorded twice."""
+    return _rows(
+        record, np.sort(np.concatenate([np.arange(len(record)), rng.integers(0, len(record), len(record) // 2)]))
+    )
+
+
+def zero_stamps(record, rng):
+    time_ns = record.time_ns.copy()
+    time_ns[rng.integers(1, len(record), max(1, len(record) // 100))] = 0
+    return _rows(record, slice(None), time_ns)
+
+
+def clock_back(record, rng):
+    """A clock that was set back while it was recorded."""
+    time_ns = record.time_ns.copy()
+    step = int(np.median(np.diff(time_ns))) * int(rng.integers(8, 200))
+    time_ns[int(rng.uniform(0.3, 0.9) * len(record)) :] -= step
+    return _rows(record, slice(None), time_ns)
+
+
+def slow_sensor(record, rng):
+    """Readings that last for a changing number of rows."""
+    starts = np.concatenate([[0], np.cumsum(rng.integers(1, 8, len(record)))])
+    last = np.searchsorted(starts, np.arange(len(record)), side="right") - 1
+    return with_signals(record, y=record.displacement["x"][starts[last]])
+
+
 def unchanged(record, rng):
     return record
 
@@ -188,7 +223,7 @@ SPOILS: Mapping[str, Spoil] = {
     for spoil in (
         unchanged, coarse, coarse_voltage, noisy, noisy_voltage, missing, stuck, held, clipped, spikes, infinite, short,
         sparse, one_way, unmoved, unrelated, inverted, other_units, exchanged, same_stamps, stamps_back, gaps, late,
-        second_axis,
+        second_axis, doubled, zero_stamps, clock_back, slow_sensor,
     )
 }  # fmt: skip
 

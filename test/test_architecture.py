@@ -239,8 +239,17 @@ def test_only_a_fleet_loads_dask() -> None:
         [sys.executable, "-c", code], cwd=ROOT.parent, stdout=subprocess.PIPE, text=True, check=True
     )
     assert not {"dask", "distributed", "pandas", "pyarrow"} & set(loaded.stdout.split())
-    using = {path.name for path in FILES if outside_imported_by(path) & {"dask", "distributed", "pandas", "pyarrow"}}
+    using = {path.name for path in FILES if outside_imported_by(path) & {"dask", "distributed", "pyarrow"}}
     assert {path.name for path in FILES if part_of(path) == "fleet"} >= using
+
+
+def test_only_a_table_loads_pandas() -> None:
+    """It takes longer to import than all else of a command."""
+    code = f"import sys, {PACKAGE}.cli, {PACKAGE}.io.tables, {PACKAGE}.nodes.identify; print(*sys.modules)"
+    loaded = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT.parent, stdout=subprocess.PIPE, text=True, check=True
+    )
+    assert not {"pandas", "h5py", "openpyxl", "nptdms"} & set(loaded.stdout.split())
 
 
 def test_only_whole_paths_load_the_compiler() -> None:

@@ -18,6 +18,7 @@ from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.errors import RecordError, length
 from slpi_ros.excitation.drives import CALIBRATION as CALIBRATION_DRIVE
 from slpi_ros.excitation.drives import SWEEP, Drive
+from slpi_ros.identification.held_readings import without_held
 from slpi_ros.identification.progress import listening
 from slpi_ros.identification.signal_statistics import noise
 from slpi_ros.io.record import Record
@@ -382,7 +383,7 @@ def _follows(axis: str, drive: Drive, record: Record, settings: CalibrationSetti
 
 def tracking_error(recording: Recording, axis: str, model: StageModel, goal: float) -> TrackingError:
     """Return the error along the path of a recording, without known errors of the sensor; `goal`: mean (m) to meet."""
-    record, desired = recording.record, recording.desired[axis]
+    record, desired = without_held(recording.record, axis)[0], recording.desired[axis]
     error = model.axis(axis).correct(record.t, record.displacement[axis]) - desired
     along = np.isfinite(error)
     if not along.any():

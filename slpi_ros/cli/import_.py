@@ -10,11 +10,23 @@ from slpi_ros.cli.command import Command, Result, command_line
 
 def _add_options(command: ArgumentParser) -> None:
     command.add_argument(
-        "table", metavar="DATA.csv|DATA.mat",
-        help="columns separated by comma, semicolon or tab; names include the unit: x_nm, x (nm), x [nm] or x in nm",
+        "table", metavar="DATA",
+        help="text (.csv, .txt, .lvm, ..), .mat, .npz, .xlsx or .tdms; names include the unit: x_nm, x (nm), x [nm] or "
+        "x in nm",
     )  # fmt: skip
     common.add_output(command, "BAG", "folder of the new bag")
-    command.add_argument("--time", metavar="COLUMN", help="default: the column whose name starts with 'time'")
+    command.add_argument(
+        "--names", metavar="NAME", nargs="+", default=(),
+        help="names of the columns of a text, of all or of those that are filled; default: those above the data",
+    )  # fmt: skip
+    time = command.add_mutually_exclusive_group()
+    time.add_argument(
+        "--time", metavar="COLUMN",
+        help="seconds of any epoch, dates or times of day; default: the column whose name starts with 'time'",
+    )  # fmt: skip
+    time.add_argument(
+        "--sample-period", metavar="S", type=float, help="seconds from row to row; default: the times of the rows"
+    )
     command.add_argument(
         "--voltage", metavar="COLUMN", nargs="+", default=(),
         help="one for all axes or one per axis; default: the columns in volts",
@@ -31,6 +43,17 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument(
         "--displacement-unit", help="m, mm, um, nm or pm, for columns without a unit in the name; default: um"
     )
+    command.add_argument(
+        "--sensor-scale", metavar="M", type=float,
+        help="metres for one unit of the columns of displacement, as of a monitor in volts; default: by their unit",
+    )  # fmt: skip
+    command.add_argument(
+        "--amplifier-gain", metavar="V/V", type=float,
+        help="volts at the stage for one unit of the columns of voltage, as of an amplifier's input; default: by their "
+        "unit",
+    )  # fmt: skip
+    command.add_argument("--sheet", metavar="NAME", help="sheet of a workbook; default: the only one")
+    command.add_argument("--group", metavar="NAME", help="group of a TDMS file; default: the only one")
     command.add_argument(
         "--axes", metavar="NAME", nargs="+", default=(), help="names of the axes; default: from the column names"
     )
@@ -53,6 +76,12 @@ def _run(options: Namespace) -> Result:
         displacement_unit=options.displacement_unit,
         axes=tuple(options.axes),
         desired=tuple(options.desired),
+        sample_period=options.sample_period,
+        sensor_scale=options.sensor_scale,
+        amplifier_gain=options.amplifier_gain,
+        names=tuple(options.names),
+        sheet=options.sheet,
+        group=options.group,
     )
     options.remarks += allow_bag(options.output, overwrite=options.overwrite)
     table = import_with_summary(options.table, columns)

@@ -14,6 +14,7 @@ from slpi_ros.devices.block import BUSY, Blocks
 from slpi_ros.devices.link import State, Status, opened
 from slpi_ros.devices.monitor import DeviceMonitor
 from slpi_ros.devices.pace import Pace
+from slpi_ros.devices.recent_readings import RecentReadings
 from slpi_ros.devices.writer import LoopSettings, Writer
 from slpi_ros.drivers.base import Device, DeviceError, Found, Reading
 from slpi_ros.io.messages import SECOND_NS
@@ -67,6 +68,7 @@ class DeviceLoop:
         self.counts, self.timing = LoopCounts(), Timing()
         self.found: Found | None = None
         self.latest: Reading | None = None
+        self.recent = RecentReadings()
         self.answers: deque[tuple[str, bool, str]] = deque()  # request, whether it succeeded, text
         self._device, self._settings, self._on_reading, self._now_ns = device, settings, on_reading, now_ns
         self._on_found = on_found
@@ -165,6 +167,7 @@ class DeviceLoop:
         reading = self._device.exchange(self._next(now_ns))
         self.counts.cycles += 1
         self.latest = reading
+        self.recent.note(reading)
         self._on_reading(reading)
         self.blocks.note(reading)
         if self._moving and not self.blocks.by_device and (found := self._writer.compare(reading, now_ns)):

@@ -439,7 +439,7 @@ def _run(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: StartMe
         t=t,
         samples=samples,
         judged=judged,
-        samples_in_span=int(np.count_nonzero(t >= since)),
+        samples_in_span=round(np.count_nonzero(t >= since) / samples.held),
         begins_known=begins_known,
         found=found,
         simulated=simulated + shift,

@@ -268,7 +268,7 @@ def lone_outliers(
         here = _outliers_of_block(y[first:end], v[first:end], gain, noise_y, (limit, beyond_kink), jump) + first
         found.append(here[(here >= start) & (here < start + _BLOCK)])
     if y.size >= _END_WINDOWS * _WINDOW:
-        still = ~_after_jumps(v[-2 * _RINGING :], jump)
+        still = ~after_jumps(v[-2 * _RINGING :], jump)
         at_start = _outliers_at_start(y, v, gain, limit)
         at_end = _outliers_at_start(y[::-1], v[::-1], gain, limit, follows=False)
         found += [at_start, np.asarray(y.size - 1 - at_end[still[-1 - at_end]])]
@@ -304,7 +304,7 @@ def _outliers_of_block(
     limit, beyond_kink = limits
     off, turns = _off_neighbours(y), np.abs(_off_neighbours(v))
     explained = 2.0 * gain * maximum_filter1d(turns, 2 * _TURN_REACH + 1)
-    found = np.flatnonzero((np.abs(off) > limit + explained) & ~_after_jumps(v, jump)[2:-2])
+    found = np.flatnonzero((np.abs(off) > limit + explained) & ~after_jumps(v, jump)[2:-2])
     # At kinks and during ringing, the neighbours do not lie on a line either.
     before, after = y[found + 1] - y[found], y[found + 4] - y[found + 3]
     across = y[found + 3] - y[found + 1]
@@ -316,7 +316,7 @@ def _outliers_of_block(
     return np.asarray(found[straight] + 2)
 
 
-def _after_jumps(v: FloatArray, jump: float) -> Mask:
+def after_jumps(v: FloatArray, jump: float) -> Mask:
     """Return the mask, shape (N,), of samples within `_RINGING` samples after a voltage jump above `jump` (V)."""
     jumps = np.flatnonzero(np.abs(np.diff(v, prepend=v[0])) > jump)
     last = np.zeros(v.size, np.int64)

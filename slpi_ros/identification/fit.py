@@ -188,7 +188,12 @@ def _require_sense(fitted: Fitted) -> None:
     """Raise IdentificationError if voltage does not explain displacement."""
     spread = float(np.std(fitted.y))
     if not fitted.held_out_rms <= SENSELESS * spread:
+        low, high = fitted.voltage_range
+        switched = (
+            ", or drive within one sign of the voltage, where it switches a ferroelectric" if low < 0.0 < high else ""
+        )
         raise IdentificationError(
             f"the voltage does not explain the displacement: held-out error {length(fitted.held_out_rms)} rms, "
             f"displacement {length(spread)} rms; check that both signals belong to this axis and have one clock"
+            f"{switched}"
         )

@@ -11,6 +11,7 @@ from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import IdentificationError, length
 from slpi_ros.identification import bad_readings, drive, signal_statistics
 from slpi_ros.identification.drive import SPEED_FACTOR
+from slpi_ros.identification.held_readings import held_readings
 from slpi_ros.identification.samples import NEAR_END, NEVER_TURNS, WINDOW, bounds, select_thinned, windows
 from slpi_ros.io.record import Record, release
 
@@ -18,6 +19,10 @@ from slpi_ros.io.record import Record, release
 _LOST, _GAP = 1.5, 5.0
 # Samples to which the drive of a record longer than `WINDOW` is thinned, besides its reversals.
 _DRIVE_SAMPLES = 500_000
+# Change of the voltage from reading to reading beside that over two, from which there are two signals.
+_ALTERNATES = 10.0
+# Median change of a voltage from sample to sample, as a share of its range, of one that jumps from turn to turn.
+_JUMPS = 0.01
 # Number of samples within which stamps recover after a late stamp.
 _CATCHES_UP = 51
 
@@ -55,6 +60,8 @@ class SignalQuality:
     mixed_share: float = 0.0  # of those tested, which are not next to a reversal
     infinite: int = 0
     mixed_size: float = 0.0  # typical largest error: half the change between the neighbours
+    alternating: bool = False  # every other reading belongs to another signal
+    held: float = 1.0  # samples for which each reading is repeated; the other figures are those of fresh readings
 
     @property
     def range(self) -> float:
@@ -69,6 +76,7 @@ class DriveQuality:
     turns: int  # reversals
     covered: float  # share of all pairs of last reversal voltage and present voltage that were visited
     samples_per_run: float  # median, between reversals
+    usual_step: float  # median change from sample to sample, share of the range
     speeds: tuple[float, ...]  # V/s, of runs with about equal voltage change, as in `Runs`
     speed_range: tuple[float, float]  # V/s, of the slowest and the fastest run
     holds: tuple[float, ...]  # s
@@ -165,6 +173,8 @@ def _whole_signal(parts: list[SignalQuality]) -> SignalQuality:
         noise=float(np.median([part.noise for part in parts])),
         digit=float(np.median([part.digit for part in parts])),
         longest_stuck=max(part.longest_stuck for part in parts),
+        held=float(np.median([part.held for part in parts])),
+        alternating=all(part.alternating for part in parts),
         mixed_share=float(np.mean([part.mixed_share for part in parts])),
         mixed_size=float(np.median(sizes)) if sizes else 0.0,
         **{name: sum(getattr(part, name) for part in parts) for name in counts},
@@ -206,6 +216,10 @@ def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality
     infinite = [int(np.count_nonzero(np.isinf(signal))) for signal in (v, y)]
     if not both.all():
         t, v, y = t[both], v[both], y[both]
+    # The voltage returns with every second reading.
+    twice = float(np.median(np.abs(np.diff(v)))) > _ALTERNATES * float(np.median(np.abs(v[2:] - v[:-2])))
+    held = held_readings(y, v)
+    t, v, y = t[held.fresh], v[held.fresh], y[held.fresh]
     far_v, far_y = bad_readings.far_outliers(v, y)
     v, y = bad_readings.without(v, far_v), bad_readings.without(y, far_y)
     gain = signal_statistics.spread(y) / signal_statistics.spread(v)
@@ -222,9 +236,11 @@ def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality
         size, share = float(np.median(ways)), mixed.size / judged
         displacement = replace(displacement, mixed=int(mixed.size), mixed_share=share, mixed_size=size)
     voltage = _signal(v, missing[0], noise_v, digit_v, stopped, off_v)
-    voltage = replace(voltage, spikes=voltage.spikes + np.setdiff1d(far_v, off_v).size, infinite=infinite[0])
+    voltage = replace(
+        voltage, spikes=voltage.spikes + np.setdiff1d(far_v, off_v).size, infinite=infinite[0], alternating=twice
+    )
     spikes = displacement.spikes + np.setdiff1d(far_y, off_y).size
-    return voltage, replace(displacement, spikes=spikes, infinite=infinite[1])
+    return voltage, replace(displacement, spikes=spikes, infinite=infinite[1], held=held.rows)
 
 
 def _signal(
@@ -265,6 +281,7 @@ def _drive(
         turns=runs.turns,
         covered=drive.covered(v, runs),
         samples_per_run=float(np.median(np.diff(at[runs.ends]))),
+        usual_step=float(np.median(np.abs(np.diff(v)))) / float(np.ptp(v)),
         speeds=runs.speeds,
         speed_range=runs.speed_range,
         holds=tuple(drive.holds(t, v, drive.hold_band(v, voltage.noise, voltage.digit)).tolist()),
@@ -313,8 +330,12 @@ def findings(quality: Quality) -> list[Finding]:
         Findings on stamps, displacement, voltage and excitation, in this order, then the notes of the record.
     """
     samples = quality.clock.samples
+    if quality.voltage.alternating:
+        text = "two publishers in one topic: every other message tells of other voltages"
+        return [Finding("stop", f"{text}; stop one of them, and record again")]
     return [
         *_clock_findings(quality.clock),
+        *_held(quality),
         *_displacement(quality.displacement),
         *_readings("displacement", quality.displacement, samples),
         *_voltage(quality.voltage),
@@ -355,6 +376,15 @@ def _clock_findings(clock: ClockQuality) -> Iterator[Finding]:
         yield Finding("warn", f"{_of(clock.duplicates, clock.samples)} with the stamp of the one before")
 
 
+def _held(quality: Quality) -> Iterator[Finding]:
+    """Say that the sensor is slower than the record."""
+    rows = quality.displacement.held
+    if rows > 1.0 and quality.clock.period:
+        rate = 1.0 / (rows * quality.clock.period)
+        text = f"the sensor is slower than the record: each reading is repeated for {rows:.3g} samples"
+        yield Finding("warn", f"{text}, {rate:.4g} are fresh per second; only these are used")
+
+
 def _displacement(y: SignalQuality) -> Iterator[Finding]:
     scatter = f"{length(y.noise)} rms" if y.noise else "below its digits"
     yield _warn_if(
@@ -387,8 +417,7 @@ def _readings(name: str, signal: SignalQuality, samples: int) -> Iterator[Findin
         yield Finding("warn", f"{text}: what goes further is not seen")
     if stuck := signal.stuck - signal.clipped:
         text = f"{name} stuck for {_of(stuck, samples)}, up to {signal.longest_stuck} in a row"
-        slow = ": the sensor is slower than the record" if stuck > 0.5 * samples else ""
-        yield Finding("warn", f"{text}{slow}; where noise should tell them apart they are not fitted")
+        yield Finding("warn", f"{text}; where noise should tell them apart they are not fitted")
     if signal.mixed:
         text = f"{name} early, late or mixed with the reading beside it in {_of(signal.mixed, samples)}"
         share = f"{100.0 * signal.mixed_share:.2g} % of those not beside a turn"
@@ -424,6 +453,9 @@ def _drive_findings(quality: Quality) -> Iterator[Finding]:
                 "again",
             )
             return
+        if drive.usual_step < _JUMPS:
+            yield Finding("stop", f"{text}, as the voltage jumps from hold to hold: drive ramps, which show the loops")
+            return
         yield Finding("stop", f"{text}: record {rate:.2g} samples per second or more, all of them, or drive slower")
         return
     yield _warn_if(
@@ -432,7 +464,8 @@ def _drive_findings(quality: Quality) -> Iterator[Finding]:
         "loops that begin elsewhere cannot be identified; turn at more voltages",
     )
     yield _memory(drive)
-    yield Finding("ok", _speeds_and_holds(drive))
+    if clock.duplicates <= 0.5 * clock.samples:
+        yield Finding("ok", _speeds_and_holds(drive))
 
 
 def _memory(drive: DriveQuality) -> Finding:

@@ -18,6 +18,7 @@ from slpi_ros.identification.bad_readings import (
     stuck,
     without,
 )
+from slpi_ros.identification.held_readings import held_readings
 from slpi_ros.identification.signal_statistics import without_noise
 from slpi_ros.io.record import Record, each_block, first_step_back, release
 
@@ -47,6 +48,7 @@ class Samples:
     history: int = 0
     mixed: int = 0  # samples not fitted because they are mixed, see `bad_readings.Mixed`
     side: int = 0  # of the neighbour that they are mixed with
+    held: float = 1.0  # samples for which each reading is repeated; only the fresh ones are fitted
 
     @property
     def primed(self) -> bool:
@@ -99,7 +101,12 @@ class Samples:
         """Return the mask, shape (N,), of the samples that `thinned` keeps."""
         every = max(1, round(self.v.size / most))
         kept = np.zeros(self.v.size, dtype=bool)
-        kept[::every] = True
+        fitted = np.flatnonzero(self.fitted)
+        if every > 1 and self.held > 1.0:
+            # Of a slow sensor, most samples have no reading of their own.
+            kept[fitted[:: max(1, round(fitted.size / most))]] = True
+        else:
+            kept[::every] = True
         if every > 1:
             # Of equal consecutive samples at a reversal, keep both ends.
             ends = np.array(monotone_runs(self.v)).ravel()
@@ -212,6 +219,7 @@ def select_thinned(
     _require_enough(record, axis, count, start, stop)
     sides = np.array([part.side for part in parts])
     whole = Samples(
+        held=float(np.median([part.held for part in parts])),
         v=np.concatenate([part.v for part in parts]),
         y=np.concatenate([part.y for part in parts]),
         fitted=np.concatenate([part.fitted for part in parts]),
@@ -265,9 +273,12 @@ def _require_enough(record: Record, axis: str, count: int, start: float | None, 
 
 
 def _examined(t: FloatArray, v: FloatArray, y: FloatArray, fitted: Mask, where: str) -> Samples:
-    """Return samples with a finite voltage without outliers, stuck and mixed readings, and noise of the voltage."""
+    """Return samples with a finite voltage without outliers, held, stuck and mixed readings, and voltage noise."""
     # The mask `fitted` has at least `FEWEST` samples and is modified in place. `where` names the record in the error of
     # signals without motion; "" for a part of a record, which is not tested.
+    known = np.flatnonzero(fitted)
+    held = held_readings(y[known], v[known])
+    fitted[known[~held.fresh]] = False
     if not fitted.all():
         y = np.where(fitted, y, 0.0)
     # Outliers of the voltage must not count as reversals or extend the range.
@@ -285,7 +296,7 @@ def _examined(t: FloatArray, v: FloatArray, y: FloatArray, fitted: Mask, where: 
     # If the record has mixed readings, only these are excluded: they look like outliers, too.
     fitted[known[mixed.readings if mixed.side else off_y]] = False
     smooth = without_noise(t, without(v, known[off_v]))
-    return Samples(smooth, y, fitted, mixed=mixed.readings.size, side=mixed.side)
+    return Samples(smooth, y, fitted, mixed=mixed.readings.size, side=mixed.side, held=held.rows)
 
 
 def part_of(t: FloatArray, start: float | None, stop: float | None) -> tuple[int, int]:
@@ -324,7 +335,20 @@ def _require_motion(v: FloatArray, y: FloatArray, fitted: Mask, where: str) -> N
     if not turns:
         raise IdentificationError(f"{where}: {NEVER_TURNS}")
     if np.corrcoef(v, y)[0, 1] < -CLEARLY:
-        raise RecordError(f"{where}: displacement falls where voltage rises; change the sign of one of them")
+        raise RecordError(
+            f"{where}: {butterfly(v, y) or 'displacement falls where voltage rises; change the sign of one of them'}"
+        )
+
+
+def butterfly(v: FloatArray, y: FloatArray) -> str:
+    """Return what a displacement (m) is that follows both signs of a voltage (V) alike, (N,); "" if it does not."""
+    both = float(v.min()) < 0.0 < float(v.max())
+    if not both or abs(np.corrcoef(np.abs(v), y)[0, 1]) <= abs(np.corrcoef(v, y)[0, 1]):
+        return ""
+    return (
+        "the displacement is V-shaped over the voltage, as of a ferroelectric that a bipolar drive switches: no model "
+        "here describes that; drive within one sign of the voltage"
+    )
 
 
 def only_one(records: Sequence[Samples], kind: str) -> Samples:

@@ -1,9 +1,10 @@
 """Alignment of voltage and displacement from separate topics to one clock."""
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +16,9 @@ from slpi_ros.io.record import Record
 
 # Longest gap, in median periods, across which values are interpolated.
 _GAP = 10.0
+# Blocks of messages by which a drift of two clocks is found, and messages in each; its standard errors, and the share
+# of a sampling period that they are apart in the end, from which it is corrected.
+_BLOCKS, _FEWEST_IN_BLOCKS, _SURE, _APART = 20, 10, 6.0, 0.1
 # Axis names for columns without names.
 _AXES = ("x", "y", "z")
 
@@ -28,7 +32,8 @@ class Signals:
     frame_id: str  # the first that is not empty
     fields: Mapping[str, Mapping[str, FloatArray]]  # ``position``, ``effort``, ``data`` or ``vector``; NaN: not given
     named: bool  # the message type names the columns, otherwise they are ``0``, ``1``, ...
-    note: str = ""  # on the order of the messages, which are sorted
+    notes: tuple[str, ...] = ()  # on messages that were left out, or sorted
+    received: int = 0  # messages, with those that were left out
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -84,7 +89,7 @@ def combine(voltage: Signals, displacement: Signals, topics: SeparateTopics, axe
         source=str(path),
         hardware_id=displacement.frame_id or voltage.frame_id,
         notes=(
-            *dict.fromkeys(filter(None, (voltage.note, displacement.note))),
+            *dict.fromkeys((*voltage.notes, *displacement.notes)),
             *notes,
             *_naming(voltage, topics.voltage, wanted),
             *_naming(displacement, topics.displacement, wanted),
@@ -137,7 +142,7 @@ def _times(
         if _overlap(voltage.stamp, displacement.stamp):
             for topic, stamp in ((topics.voltage, voltage.stamp), (topics.displacement, displacement.stamp)):
                 _require_order(stamp, f"{where}: stamps of '{topic}'")
-            return voltage.stamp, displacement.stamp, []
+            return voltage.stamp, *_in_one_clock(voltage, displacement, topics)
         reason = "their header stamps are of different clocks"
     else:
         unstamped = [
@@ -150,6 +155,36 @@ def _times(
         raise RecordError(f"{where}: at no time were both recorded; record them together")
     note = f"aligned by the time of recording ({reason}): late messages are paired with the wrong voltage"
     return voltage.logged, displacement.logged, [note]
+
+
+def _in_one_clock(voltage: Signals, displacement: Signals, topics: SeparateTopics) -> tuple[IntArray, list[str]]:
+    """Return the stamps of the displacement by the clock of those of the voltage, and a note if they drift apart."""
+    # Both were recorded by one clock: each stamp's drift is that against the times of recording.
+    assert voltage.stamp is not None and displacement.stamp is not None
+    driven, uncertain = _rate(voltage.stamp, voltage.logged)
+    moved, also = _rate(displacement.stamp, displacement.logged)
+    rate, error = moved - driven, math.hypot(uncertain, also)
+    time = displacement.stamp - displacement.stamp[0]
+    apart = abs(rate) * float(time[-1])
+    if not (abs(rate) > _SURE * error and apart > _APART * float(np.median(np.diff(displacement.stamp)))):
+        return displacement.stamp, []
+    # The rate of the recorder's clock against that of the voltage is not known better than to itself: it cancels.
+    stamps: IntArray = displacement.stamp - np.rint(time * (rate / (1.0 + rate))).astype(np.int64)
+    how = f"{1e6 * abs(rate):.3g} ppm {'faster' if rate > 0.0 else 'slower'} than that of '{topics.voltage}'"
+    told = f"the clock of '{topics.displacement}' goes {how}, {apart * 1e-9:.3g} s in all: its stamps were corrected"
+    return stamps, [told]
+
+
+def _rate(stamp: IntArray, logged: IntArray) -> tuple[float, float]:
+    """Return the relative rate of the clock of stamps (ns, (N,)) against that of recording, less 1, and its error."""
+    blocks = np.array_split(np.arange(stamp.size), _BLOCKS)
+    if stamp.size < _FEWEST_IN_BLOCKS * _BLOCKS:
+        return 0.0, math.inf
+    since = (logged - logged[0]).astype(np.float64)
+    # Messages come late now and then: medians.
+    at, late = (np.array([np.median(x[block]) for block in blocks]) for x in (since, stamp - stamp[0] - since))
+    (rate, _), covariance = np.polyfit(at / at[-1], late, 1, cov=True)
+    return float(rate / at[-1]), float(np.sqrt(covariance[0, 0]) / at[-1])
 
 
 def _overlap(one: IntArray, other: IntArray) -> bool:
@@ -172,7 +207,7 @@ def _on_displacement(voltage: _Series, displacement: _Series, held: bool) -> _Al
     time = displacement.time[known]
     y = {axis: column[known] for axis, column in displacement.columns.items()}
     if not held:
-        return time, {axis: _between(time, voltage.time, column) for axis, column in voltage.columns.items()}, y
+        return time, {axis: between(time, voltage.time, column) for axis, column in voltage.columns.items()}, y
     current = np.searchsorted(voltage.time, time, side="right") - 1
     unseen = _unseen_turns(voltage, current)
     # Each missing reversal is inserted before the first displacement that is not earlier.
@@ -210,12 +245,12 @@ def _on_voltage(voltage: _Series, displacement: _Series, held: bool) -> _Aligned
     return (
         time,
         {axis: column[known] for axis, column in v.items()},
-        {axis: _between(time, displacement.time, column) for axis, column in displacement.columns.items()},
+        {axis: between(time, displacement.time, column) for axis, column in displacement.columns.items()},
     )
 
 
-def _between(time: IntArray, known_at: IntArray, values: FloatArray) -> FloatArray:
-    """Interpolate linearly; the result is NaN within long gaps."""
+def between(time: NDArray[Any], known_at: NDArray[Any], values: FloatArray) -> FloatArray:
+    """Return values (N,), known at ascending times (N,), at other times (M,): linear between them, NaN in long gaps."""
     start = known_at[0]
     result = np.interp((time - start).astype(np.float64), (known_at - start).astype(np.float64), values)
     steps = np.diff(known_at)

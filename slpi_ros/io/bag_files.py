@@ -14,7 +14,7 @@ from tempfile import TemporaryDirectory
 from typing import BinaryIO
 
 from slpi_ros.errors import RecordError, SlpiError, UsageError
-from slpi_ros.io.bag_storage import bounded_records, is_packed, zstd
+from slpi_ros.io.bag_storage import MCAP_END, is_packed, zstd
 from slpi_ros.io.input_limits import (
     BAG_BYTES,
     METADATA_BYTES,
@@ -27,11 +27,11 @@ from slpi_ros.io.input_limits import (
 from slpi_ros.io.unfinished_bags import abandoned_in, is_being_written, partial_path, place_of
 
 SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
-# The parts of a split bag end in their number.
-_PART = re.compile(r"(.*)_(\d+)(\.(?:mcap|db3)(?:\.zstd)?)")
+# The parts of a split bag end in their number; those of ROS 2 Lyrical begin with it, and end in a date.
+_PART = re.compile(r"(?P<prefix>.*)_(?P<number>\d+)\.(?:mcap|db3)")
+_COUNTED = re.compile(r"(?P<number>\d+)_(?P<prefix>.*?)(?:_\d{4}[-_\d]*)?\.(?:mcap|db3)")
 _WANTED = "give a rosbag2 folder or an .mcap or .db3 file"
-# The last bytes of a complete mcap file.
-_MCAP_END = b"\x89MCAP0\r\n"
+_LFS = b"version https://git-lfs"
 # An alias in YAML. No recorder writes one, and nested ones stand for more text than any memory holds.
 _ALIAS = re.compile(rb"(?:[:?-]\s+|[\[,{]\s*)\*\S")
 # Seconds without growth until a recording counts as abandoned: a writer fills a whole chunk before its file grows.
@@ -59,24 +59,55 @@ def locate(path: Path) -> list[Path]:
         raise RecordError(f"{path}: not a bag of ROS 2; {hint}")
     if not path.is_dir():
         raise RecordError(f"{path}: neither a folder nor a regular file; {_WANTED}")
-    if (path / "metadata.yaml").exists():
-        return [path]
     files = [file for file in path.iterdir() if file.name.endswith(SUFFIXES)]
+    listed, _ = metadata(path)
     if not files:
-        raise RecordError(f"{path}: a folder without metadata.yaml and without .mcap or .db3 file; not a bag")
-    return files if len(files) == 1 else _parts(files, path)
+        told = "whose metadata.yaml lists" if listed else "without metadata.yaml and without"
+        raise RecordError(f"{path}: a folder {told} {', '.join(listed)[:200] or '.mcap or .db3 file'}; not a bag")
+    return files if len(files) == 1 else _parts(files, listed, path)
 
 
-def _parts(files: list[Path], folder: Path) -> list[Path]:
+def _parts(files: list[Path], listed: list[str], folder: Path) -> list[Path]:
     """Return the files of a split bag in order; RecordError if they are not the parts of a single bag."""
-    names = [_PART.fullmatch(file.name) for file in files]
-    order = sorted(int(name[2]) if name else -1 for name in names)
-    if order != list(range(len(files))) or len({(name[1], name[3]) for name in names if name}) > 1:
-        raise RecordError(
-            f"{folder}: {len(files)} bag files but no metadata.yaml, and they are not parts 0 to {len(files) - 1} of "
-            f"one bag; make one with `ros2 bag reindex {folder}`, or give one of the files"
-        )
-    return sorted(files, key=lambda file: int(file.name.rpartition("_")[2].partition(".")[0]))
+    plain = {file.name.removesuffix(".zstd"): file for file in files}
+    known = [plain.pop(name) for name in dict.fromkeys(listed) if name in plain]
+    # Parts that are not listed were written after metadata.yaml.
+    for pattern in (_COUNTED, _PART):
+        found = [(int(name["number"]), name["prefix"], name[0]) for one in plain if (name := pattern.fullmatch(one))]
+        last = len(known) + len(plain)
+        if [number for number, *_ in sorted(found)] == list(range(len(known), last)) and len(
+            {p for _, p, _ in found}
+        ) < 2:
+            return [*known, *(plain[name] for *_, name in sorted(found))]
+    if known:
+        return [*known, *(plain[name] for name in sorted(plain))]
+    raise RecordError(
+        f"{folder}: {len(files)} bag files but no metadata.yaml, and they are not parts 0 to {len(files) - 1} of "
+        f"one bag; make one with `ros2 bag reindex {folder}`, or give one of the files"
+    )
+
+
+def metadata(folder: Path) -> tuple[list[str], dict[str, int]]:
+    """Return the files that ``metadata.yaml`` lists, by their names, and the numbers of messages by topic."""
+    # Of any version; what it says of types and storage is in the files themselves, too.
+    path = folder / "metadata.yaml"
+    if not path.exists():
+        return [], {}
+    with translated(folder):
+        from ruamel.yaml import YAML
+
+        content = read_input(path, METADATA_BYTES)
+        if _ALIAS.search(content):
+            raise LimitError(f"{path.name} has an alias, which no recorder writes")
+        told = YAML(typ="safe").load(content)["rosbag2_bagfile_information"]
+        names = [os.path.basename(name).removesuffix(".zstd") for name in told.get("relative_file_paths") or []]
+        counts: dict[str, int] = {}
+        for topic in told.get("topics_with_message_count") or []:
+            name, count = topic["topic_metadata"]["name"], topic["message_count"]
+            if not (isinstance(name, str) and isinstance(count, int) and count >= 0):
+                raise TypeError(f"name {name!r} or message_count {count!r} of a topic is wrong")
+            counts[name] = counts.get(name, 0) + count
+        return names, counts
 
 
 @contextmanager
@@ -113,28 +144,18 @@ def translated(source: Path) -> Iterator[None]:
         raise RecordError(f"{source}: damaged or unfinished ({reason}); {_remedy(source)}") from error
 
 
-def require_bounded(source: Path) -> None:
-    """Raise an error if a file of a bag is truncated, or would let other readers read without an end."""
-    files = sorted(source.iterdir()) if source.is_dir() else [source]
-    require_inputs(files, BAG_BYTES)
-    for file in files:
-        _require_bounded(file)
-
-
-def _require_bounded(file: Path) -> None:
-    if file.is_dir():
-        return
-    if file.name == "metadata.yaml":
-        if _ALIAS.search(read_input(file, METADATA_BYTES)):
-            raise LimitError(f"{file.name} has an alias, which no recorder writes")
-        return
+def require_bounded(file: Path) -> None:
+    """Raise an error if a file of a bag is truncated, empty, or would unpack without an end."""
+    require_inputs([file], BAG_BYTES)
     with open_input(file, BAG_BYTES) as stream:
         header = stream.read(100)
+        if header.startswith(_LFS):
+            raise RecordError(f"{file}: a pointer of Git LFS instead of the file; get it with `git lfs pull`")
+        if not header:
+            raise RecordError(f"{file}: an empty file; its recorder has written nothing, record again")
         if is_packed(header):
-            # rosbags unpacks a file as a whole.
+            # It is unpacked as a whole.
             _require_small(stream, file)
-        elif header.startswith(_MCAP_END):
-            bounded_records(stream)
     if file.suffix == ".db3" or header.startswith(b"SQLite format 3"):
         _require_whole(file, header)
 
@@ -189,7 +210,7 @@ def match_topic(topics: Mapping[str, str], topic: str, msgtypes: Collection[str]
     contents = ", ".join(f"{name} ({topics[name]})" for name in sorted(topics)) or "no topics"
     wanted = absolute_name(topic)
     found = [name for name in topics if absolute_name(name) == wanted]
-    found = found or sorted(name for name in topics if name.endswith(wanted))
+    found = found or sorted(name for name in topics if absolute_name(name).endswith(wanted))
     if not found:
         raise RecordError(
             f"{source}: no topic '{topic}'; the bag holds {contents}; name the right one (--topic; of desired "
@@ -260,11 +281,11 @@ def _finished(path: Path) -> int | None:
     metadata = path / "metadata.yaml"
     if path.is_dir():
         return metadata.stat().st_mtime_ns if metadata.is_file() and metadata.stat().st_size else None
-    if path.suffix != ".mcap" or path.stat().st_size <= 2 * len(_MCAP_END):
+    if path.suffix != ".mcap" or path.stat().st_size <= 2 * len(MCAP_END):
         return None
     with open_input(path, BAG_BYTES) as file:
-        file.seek(-len(_MCAP_END), os.SEEK_END)
-        return path.stat().st_mtime_ns if file.read() == _MCAP_END else None
+        file.seek(-len(MCAP_END), os.SEEK_END)
+        return path.stat().st_mtime_ns if file.read() == MCAP_END else None
 
 
 def _grown(path: Path) -> int | None:

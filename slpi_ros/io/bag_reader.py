@@ -1,31 +1,40 @@
 """Reading of records from bags: rosbag2 folders or single files, mcap or sqlite3, compressed or not."""
-# Only this module and ``bag_writer`` import rosbags; rosbags exceptions do not propagate beyond them.
 
 import os
-from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.rosbag2 import Reader
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.io.alignment import SeparateTopics, Signals, combine
-from slpi_ros.io.bag_files import absolute_name, locate, match_topic, require_bounded, translated, unpacked
-from slpi_ros.io.bag_storage import MessageBlock, read_mcap, read_sqlite
-from slpi_ros.io.input_limits import MOST_AXES, require_count
-from slpi_ros.io.messages import JOINT_STATE, MESSAGE_TYPES, QUANTITY_TYPES, SECOND_NS, Message, kind_of, read_message
-from slpi_ros.io.record import BLOCK, Course, Record, each_block, new_column, order_note, release
+from slpi_ros.io.bag_files import absolute_name, locate, match_topic, metadata, require_bounded, translated, unpacked
+from slpi_ros.io.bag_storage import Connection, McapFile, MessageBlock, SqliteFile
+from slpi_ros.io.input_limits import BAG_BYTES, MOST_AXES, open_input, require_count
+from slpi_ros.io.message_order import in_order
+from slpi_ros.io.messages import (
+    JOINT_STATE,
+    JOINT_TRAJECTORY,
+    MESSAGE_TYPES,
+    QUANTITY_TYPES,
+    SECOND_NS,
+    Message,
+    kind_of,
+    read_message,
+)
+from slpi_ros.io.record import BLOCK, Course, Record, each_block, new_column, release
 from slpi_ros.io.stage_name import stage_name
 from slpi_ros.io.surroundings import MOST, Chosen, courses, since_start_of, topics_beside, wild
 from slpi_ros.io.unfinished_bags import NOTE, completed, is_abandoned
 
 _Path = str | os.PathLike[str]
+# Types of messages that are read.
+_READ = {*MESSAGE_TYPES, *QUANTITY_TYPES, JOINT_TRAJECTORY}
 
 
 def read_bag(
@@ -87,7 +96,7 @@ def _record_of(state: Signals, chosen: Sequence[str], path: Path) -> Record:
         displacement={axis: state.fields["position"][axis] for axis in chosen},
         source=str(path),
         hardware_id=state.frame_id,
-        notes=(*([state.note] if state.note else []), *unstamped),
+        notes=(*state.notes, *unstamped),
     )
 
 
@@ -163,9 +172,8 @@ class Bag:
     def __init__(self, sources: Sequence[Path], path: Path) -> None:
         self._sources = sources
         self._path = path
+        self._files: list[tuple[McapFile | SqliteFile, Path]] = []
         self._topics: dict[str, str] = {}
-        self._counts: Counter[str] = Counter()
-        self._storages: list[tuple[Any, Path]] = []
         self._stack = ExitStack()
         self.notes: tuple[str, ...] = ()  # what is to be told of the bag as a whole
 
@@ -176,41 +184,60 @@ class Bag:
                     whole = stack.enter_context(completed(source))
                     self.notes = (NOTE,) if is_abandoned(source) else ()
                     require_bounded(whole)
-                    self._open(whole, source, stack)
+                    self._files.append((self._open(stack.enter_context(unpacked(whole)), stack), source))
+            for each in (each for file, _ in self._files for each in file.connections):
+                # Of several types of one topic the one that is read comes first.
+                known = self._topics.get(each.topic)
+                if known is None or (known not in _READ and _type_of(each) in _READ):
+                    self._topics[each.topic] = _type_of(each)
             self._stack = stack.pop_all()
         return self
 
     def __exit__(self, *_: object) -> None:
         self._stack.close()
 
-    def _open(self, whole: Path, source: Path, stack: ExitStack) -> None:
-        reader = stack.enter_context(Reader(stack.enter_context(unpacked(whole))))
-        for connection in reader.connections:
-            # They are not checked by the reader of metadata.yaml.
-            for name, value in (("name", connection.topic), ("type", connection.msgtype)):
-                if not isinstance(value, str):
-                    raise TypeError(f"{name} {value!r} of a topic is no text")
-            if not isinstance(connection.msgcount, int) or connection.msgcount < 0:
-                raise TypeError(f"message_count {connection.msgcount!r} of topic {connection.topic} is no count")
-            self._topics[connection.topic] = connection.msgtype
-            self._counts[connection.topic] += connection.msgcount
-        # The reader of a folder has one storage for each file, decompressed if necessary; that of a file is itself one.
-        storages = getattr(reader.storage, "storages", [reader.storage])
-        self._storages += [(storage, source) for storage in storages]
+    def _open(self, path: Path, stack: ExitStack) -> McapFile | SqliteFile:
+        if path.suffix == ".db3":
+            return stack.enter_context(closing(SqliteFile(path)))
+        return McapFile(stack.enter_context(open_input(path, BAG_BYTES)))
 
     def holds(self, topic: str) -> bool:
         """Return whether there is a message on a topic, given by its full name or by its last parts."""
         wanted = absolute_name(topic)
-        return any(name.endswith(wanted) and self._counts[name] for name in self._topics)
+        return any(absolute_name(name).endswith(wanted) and self._count(name) for name in self._topics)
 
     def read(self, topic: str, msgtypes: Iterable[str]) -> Signals:
         """Return the decoded messages of a topic, which must have one of the message types."""
         name = match_topic(self._topics, topic, tuple(msgtypes), self._path)
         with translated(self._path):
-            signals = decode_signals(self._blocks(name), self._topics[name], self._counts[name])
+            signals = decode_signals(self._blocks(name), self._topics[name], self._count(name))
         if signals is None:
             raise RecordError(f"{self._path}: no message on topic '{topic}'; was the stage's driver running?")
-        return signals
+        return replace(signals, notes=(*signals.notes, *self._missing(name, signals.received)))
+
+    def _count(self, topic: str) -> int:
+        return sum(each.count for file, _ in self._files for each in self._of(file, topic))
+
+    def _of(self, file: McapFile | SqliteFile, topic: str) -> list[Connection]:
+        """Return the connections of a topic whose messages have the type that is read."""
+        return [each for each in file.connections if each.topic == topic and _type_of(each) == self._topics[topic]]
+
+    def _missing(self, topic: str, received: int) -> Iterator[str]:
+        """Yield what of a topic is not read: messages of another type, and those that only ``metadata.yaml`` knows."""
+        others = [each for file, _ in self._files for each in file.connections if each.topic == topic]
+        for each in others:
+            if _type_of(each) != self._topics[topic] and each.count:
+                yield f"{each.count} messages of another type, {_type_of(each)}, on the same topic are left out"
+        listed, counts = metadata(self._path) if self._path.is_dir() else ([], {})
+        there = {source.name.removesuffix(".zstd") for source in self._sources}
+        gone, extra = [name for name in listed if name not in there], sorted(there - set(listed)) if listed else []
+        read = received + sum(each.count for each in others if _type_of(each) != self._topics[topic])
+        if gone and len(gone) < len(listed):
+            yield f"{', '.join(gone)} of metadata.yaml is not in the folder: a part of the recording is missing"
+        elif extra and not gone:
+            yield f"{', '.join(extra)} is not in metadata.yaml, and is read, too"
+        elif counts.get(topic, read) > read:
+            yield f"metadata.yaml tells of {counts[topic]} messages, there are {read}: the others are lost"
 
     @property
     def types(self) -> Mapping[str, str]:
@@ -232,10 +259,16 @@ class Bag:
                 yield from zip(block.logged.tolist(), block.each(), strict=True)
 
     def _blocks(self, topic: str) -> Iterator[MessageBlock]:
-        for storage, source in self._storages:
+        for file, source in self._files:
             with translated(source):
-                is_mcap = storage.path.suffix == ".mcap"
-                yield from read_mcap(storage.path, topic) if is_mcap else read_sqlite(storage, topic)
+                if numbers := {each.number for each in self._of(file, topic)}:
+                    yield from file.blocks(numbers)
+
+
+def _type_of(connection: Connection) -> str:
+    """Return the type of messages; with their encoding where it is not that of ROS 2."""
+    plain = connection.encoding in ("cdr", "")
+    return connection.msgtype if plain else f"{connection.msgtype} in {connection.encoding}"
 
 
 def _choose_axes(state: Signals, axes: Sequence[str] | None, where: str) -> tuple[str, ...]:
@@ -246,12 +279,13 @@ def _choose_axes(state: Signals, axes: Sequence[str] | None, where: str) -> tupl
     chosen = tuple(axes or state.names)
     for axis in chosen:
         if axis not in state.names:
-            raise RecordError(f"{where}: no axis '{axis}'; there is {names}")
+            raise RecordError(f"{where}: no axis '{axis}'; there is {names} (--axis)")
         for field in ("position", "effort"):
             if all(np.isnan(part).all() for (part,) in each_block(state.fields[field][axis])):
                 raise RecordError(
                     f"{where}: axis '{axis}' has no value in {field}[] of any message; position[] must hold "
-                    f"the measured metres, effort[] the applied volts; else read other axes, of {names}"
+                    f"the measured metres, effort[] the applied volts; else read other axes, of {names} (--axis), or "
+                    "topics of their own (--voltage-topic, --displacement-topic)"
                 )
     return chosen
 
@@ -266,19 +300,18 @@ def decode_signals(blocks: Iterable[MessageBlock], msgtype: str, expected: int =
     if not columns.count:
         return None
     arrays = columns.arrays()
-    logged, stamp = arrays[_LOGGED], arrays[_STAMP]
-    note = order_note(logged)
-    if note:
-        order = np.argsort(logged, kind="stable")
-        arrays = {key: array[order] for key, array in arrays.items()}
-        logged, stamp = arrays[_LOGGED], arrays[_STAMP]
+    received = arrays[_LOGGED].size
+    values = {key: array for key, array in arrays.items() if key[0]}
+    rows, stamped, notes = in_order(arrays[_LOGGED], arrays[_STAMP], values)
+    if rows is not None and (rows.size < received or (np.diff(rows) < 0).any()):
+        arrays = {key: array[rows] for key, array in arrays.items()}
     kind = kind_of(msgtype)
     fields: dict[str, dict[str, FloatArray]] = {field: {} for field in kind.fields}
     for (field, name), array in arrays.items():
         if field:
             fields[field][name] = array
-    stamped = any(part.any() for (part,) in each_block(stamp))
-    return Signals(logged, stamp if stamped else None, frame_id, fields, kind.named, note)
+    stamp = arrays[_STAMP] if stamped else None
+    return Signals(arrays[_LOGGED], stamp, frame_id, fields, kind.named, tuple(notes), received)
 
 
 # Key of a column: field and name; for times the field is empty.
@@ -311,7 +344,7 @@ class _Columns:
         new = [key for key in part if key not in self._arrays]
         require_count(len({name for _, name in (*self._arrays, *new)}), MOST_AXES + len((_LOGGED, _STAMP)), "names")
         for key in new:
-            self._arrays[key] = new_column(self._room, part[key].dtype)
+            self._arrays[key] = new_column(self._room, part[key].dtype.newbyteorder("="))
             if start:
                 self._arrays[key][:start] = np.nan
         for key, array in self._arrays.items():

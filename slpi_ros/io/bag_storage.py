@@ -2,16 +2,15 @@
 
 MCAP files are read chunk by chunk, without a loop over the messages: ten times as fast as with rosbags. Format:
 https://mcap.dev/spec. A file is a sequence of records. Most of them are chunks, which contain further records; each
-chunk is followed by indexes of its messages. Chunks without the wanted topic are skipped. SQLite files are read with
-rosbags.
+chunk is followed by indexes of its messages. Chunks without the wanted topic are skipped.
 """
 
+import sqlite3
 import struct
 import sys
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from itertools import islice
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -19,13 +18,11 @@ import numpy as np
 
 from slpi_ros.arrays import IntArray
 from slpi_ros.io.cdr import ByteArray
-from slpi_ros.io.input_limits import BAG_BYTES, CHUNK_BYTES, MESSAGE_BYTES, LimitError, most_unpacked, open_input
+from slpi_ros.io.input_limits import CHUNK_BYTES, MESSAGE_BYTES, LimitError, most_unpacked
 
 # Number of messages per block where the file itself has no chunks.
 BLOCK = 4_000
 
-# SQLITE_LIMIT_LENGTH of sqlite3.h
-_LIMIT_LENGTH = 0
 _ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 
 
@@ -110,7 +107,11 @@ def zstd() -> Any:
     return module
 
 
-_CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _DATA_END = 0x04, 0x05, 0x06, 0x07, 0x0F
+# The first and last bytes of an MCAP file.
+MCAP_END = b"\x89MCAP0\r\n"
+_SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _MESSAGE_INDEX, _STATISTICS, _DATA_END = 0x03, 0x04, 0x05, 0x06, 0x07, 0x0B, 0x0F
+# In the statistics, where the numbers of messages by channel begin, and each of them.
+_COUNTS_AT, _COUNTED = 46, struct.Struct("<HQ")
 _MAGIC_SIZE, _FOOTER_SIZE = 8, 37
 _RECORD = struct.Struct("<BQ")
 _CHUNK_HEAD = struct.Struct("<QQQII")
@@ -124,40 +125,61 @@ _MESSAGE_HEAD = np.dtype(
 _HEAD_IN_LENGTH = _MESSAGE_HEAD.itemsize - _RECORD.size
 
 
-def read_mcap(path: Path, topic: str) -> Iterator[MessageBlock]:
-    """Yield the messages of a topic, by its full name, as written, from a complete file; any exception if damaged."""
-    with open_input(path, BAG_BYTES) as file:
-        yield from _McapFile(file, topic).blocks()
+@dataclass(frozen=True)
+class Connection:
+    """Topic in a bag file, with the type and the encoding of its messages; a topic may have several."""
+
+    topic: str
+    msgtype: str  # as ``sensor_msgs/msg/JointState``
+    encoding: str  # ``cdr`` for all of ROS 2
+    count: int
+    number: int  # in its file
 
 
-def bounded_records(file: BinaryIO) -> None:
-    """Raise an error if the chunks of an MCAP file without a summary are too large: rosbags unpacks all of them."""
-    records = _McapFile(file, "")
-    if not records.has_summary:
-        for _ in records.blocks():
-            pass
+def _connection(topic: str, msgtype: str, encoding: str, count: int, number: int) -> Connection:
+    """Return a connection whose type is written as in ROS 2, whatever short name or name of DDS it has."""
+    parts = [part.removesuffix("_") for part in msgtype.replace("::", "/").split("/") if part != "dds_"]
+    short = len(parts) == 2 and encoding in ("cdr", "")
+    return Connection(topic, "/".join([parts[0], "msg", parts[1]] if short else parts), encoding, count, number)
 
 
-class _McapFile:
-    """Reader of the messages of one topic in an MCAP file."""
+def has_bounded_chunks(file: BinaryIO) -> None:
+    """Raise an error if the chunks of an MCAP file without a summary unpack to more than any recording."""
+    McapFile(file)
 
-    def __init__(self, file: BinaryIO, topic: str) -> None:
+
+class McapFile:
+    """Reader of a complete MCAP file; any exception if it is damaged."""
+
+    def __init__(self, file: BinaryIO) -> None:
         self._file = file
-        self._topic = topic.encode()
-        self._channels: set[int] = set()
+        self._schemas: dict[int, str] = {}
+        self._channels: dict[int, tuple[str, int, str]] = {}
+        self._counts: dict[int, int] = {}
         self._end = file.seek(-_FOOTER_SIZE, 2)
         self._left = most_unpacked(self._end)
-        self._summary = int.from_bytes(self._read(self._end + _RECORD.size, 8), "little")
-        if self._summary:
-            for op, start, length in self._records(self._summary):
-                if op == _CHANNEL:
-                    self._learn(self._read(start, length))
-        self.has_summary = bool(self._summary)
-        # Without a summary a channel may be announced within any chunk.
-        self._all_known = bool(self._channels)
+        if self._read(self._end + _FOOTER_SIZE - _MAGIC_SIZE, _MAGIC_SIZE) != MCAP_END:
+            raise EOFError("no end of the file")
+        summary = int.from_bytes(self._read(self._end + _RECORD.size, 8), "little")
+        for op, start, length in self._records(summary or _MAGIC_SIZE):
+            # Without a summary, channels are announced anywhere.
+            if op == _CHUNK and not summary:
+                self._walk(self._unpack(start, length), set())
+            elif op in (_SCHEMA, _CHANNEL, _STATISTICS):
+                self._learn(op, self._read(start, length))
+        self._left = most_unpacked(self._end)
 
-    def blocks(self) -> Iterator[MessageBlock]:
-        """Yield the messages, chunk by chunk."""
+    @property
+    def connections(self) -> list[Connection]:
+        """Topics of the file; one whose messages are not counted is taken to have one."""
+        counted = self._counts or dict.fromkeys(self._channels, 1)
+        return [
+            _connection(topic, self._schemas.get(schema, ""), encoding, counted.get(number, 0), number)
+            for number, (topic, schema, encoding) in self._channels.items()
+        ]
+
+    def blocks(self, channels: set[int]) -> Iterator[MessageBlock]:
+        """Yield the messages of some channels, chunk by chunk, as written."""
         chunk: tuple[int, int] | None = None
         indexes: list[bytes] = []
         bare: list[tuple[int, bytes]] = []
@@ -166,13 +188,11 @@ class _McapFile:
                 indexes.append(self._read(start, length))
                 continue
             if chunk:
-                yield from self._chunk(*chunk, indexes)
+                yield from self._chunk(*chunk, indexes, channels)
                 chunk, indexes = None, []
             if op == _CHUNK:
                 chunk = start, length
-            elif op == _CHANNEL:
-                self._learn(self._read(start, length))
-            elif op == _MESSAGE and int.from_bytes(self._read(start, 2), "little") in self._channels:
+            elif op == _MESSAGE and int.from_bytes(self._read(start, 2), "little") in channels:
                 data = self._read(start, length)
                 bare.append((int.from_bytes(data[6:14], "little"), data[_HEAD_IN_LENGTH:]))
             if len(bare) == BLOCK or (bare and op == _DATA_END):
@@ -201,24 +221,29 @@ class _McapFile:
             raise EOFError(f"{len(data)} of {size} bytes at {position}")
         return data
 
-    def _learn(self, channel: bytes) -> None:
-        """Store the id of a channel if it belongs to the topic."""
-        size = int.from_bytes(channel[4:8], "little")
-        if channel[8 : 8 + size] == self._topic:
-            self._channels.add(int.from_bytes(channel[:2], "little"))
+    def _learn(self, op: int, data: bytes) -> None:
+        """Store a schema, a channel, or the numbers of messages of all channels."""
+        number = int.from_bytes(data[:2], "little")
+        if op == _SCHEMA:
+            self._schemas[number] = _text(data, 2)[0]
+        elif op == _CHANNEL:
+            topic, at = _text(data, 4)
+            self._channels[number] = topic, int.from_bytes(data[2:4], "little"), _text(data, at)[0]
+        else:
+            self._counts = dict(_COUNTED.iter_unpack(data[_COUNTS_AT:]))
 
-    def _chunk(self, start: int, length: int, indexes: list[bytes]) -> Iterator[MessageBlock]:
-        """Yield the messages of the topic in a chunk as one block, if there are any."""
-        if indexes and self._all_known:
-            offsets = _indexed(indexes, self._channels)
+    def _chunk(self, start: int, length: int, indexes: list[bytes], channels: set[int]) -> Iterator[MessageBlock]:
+        """Yield the messages of the channels in a chunk as one block, if there are any."""
+        if indexes:
+            offsets = _indexed(indexes, channels)
             if not offsets.size:
                 return
             records = self._unpack(start, length)
         else:
             records = self._unpack(start, length)
-            offsets = self._walk(records)
+            offsets = self._walk(records, channels)
         if offsets.size:
-            yield _gather(np.frombuffer(records, np.uint8), offsets, self._channels)
+            yield _gather(np.frombuffer(records, np.uint8), offsets, channels)
 
     def _unpack(self, start: int, length: int) -> bytes:
         records = _records_of_chunk(self._read(start, length))
@@ -227,18 +252,24 @@ class _McapFile:
             raise LimitError("the chunks unpack to more than any recording")
         return records
 
-    def _walk(self, records: bytes) -> IntArray:
-        """Return the offsets of the wanted messages in a chunk without index."""
+    def _walk(self, records: bytes, channels: set[int]) -> IntArray:
+        """Return the offsets of the messages of the channels in a chunk without index; learn from the others."""
         offsets, position = [], 0
         while position < len(records):
             op, length = _RECORD.unpack_from(records, position)
             start = position + _RECORD.size
-            if op == _CHANNEL:
-                self._learn(records[start : start + length])
-            elif op == _MESSAGE and int.from_bytes(records[start : start + 2], "little") in self._channels:
+            if op in (_SCHEMA, _CHANNEL):
+                self._learn(op, records[start : start + length])
+            elif op == _MESSAGE and int.from_bytes(records[start : start + 2], "little") in channels:
                 offsets.append(position)
             position = start + length
         return np.array(offsets, np.int64)
+
+
+def _text(data: bytes, at: int) -> tuple[str, int]:
+    """Return a text that is preceded by its size, and where it ends."""
+    end = at + 4 + int.from_bytes(data[at : at + 4], "little")
+    return data[at + 4 : end].decode(), end
 
 
 def _indexed(indexes: list[bytes], channels: set[int]) -> IntArray:
@@ -300,21 +331,30 @@ def _rows(data: ByteArray, starts: IntArray, length: int) -> ByteArray:
     return rows
 
 
-def read_sqlite(storage: Any, topic: str) -> Iterator[MessageBlock]:
-    """Yield the messages of a topic, by its full name, as recorded; any exception if the file is damaged."""
-    # `storage` is the ``rosbags.rosbag2.storage_sqlite3.Sqlite3Reader`` of the open file.
-    connections = [connection for connection in storage.connections if connection.topic == topic]
-    messages = _bounded(storage, connections) if connections else iter(())
-    while block := list(islice(messages, BLOCK)):
-        yield MessageBlock.of([logged for _, logged, _ in block], [message for _, _, message in block])
+class SqliteFile:
+    """Reader of an SQLite file of rosbag2; any exception if it is damaged."""
 
+    def __init__(self, path: Path) -> None:
+        self._size = path.stat().st_size
+        self._base = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro&immutable=1", uri=True)
+        self._base.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, MESSAGE_BYTES)
+        count = "(SELECT count(*) FROM messages WHERE topic_id = topics.id)"
+        topics = self._base.execute(f"SELECT name, type, serialization_format, {count}, id FROM topics").fetchall()
+        for name, kind, *_ in topics:
+            if not (isinstance(name, str) and isinstance(kind, str)):
+                raise TypeError(f"name {name!r} or type {kind!r} of a topic is no text")
+        self.connections = [_connection(*topic) for topic in topics]
 
-def _bounded(storage: Any, connections: Any) -> Iterator[tuple[Any, int, bytes]]:
-    """Yield the messages of an SQLite file; an error if a column computes them, larger than the file."""
-    storage.dbconn.limit(_LIMIT_LENGTH, MESSAGE_BYTES)
-    left = most_unpacked(storage.path.stat().st_size)
-    for row in storage.messages(connections):
-        left -= len(row[2])
-        if left < 0:
-            raise LimitError(f"{storage.path.name} holds more bytes in messages than any recording")
-        yield row
+    def blocks(self, topics: set[int]) -> Iterator[MessageBlock]:
+        """Yield the messages of some topics, as recorded; LimitError if they are larger than the file."""
+        query = f"SELECT timestamp, data FROM messages WHERE topic_id IN ({','.join(map(str, topics))}) ORDER BY id"
+        rows, left = self._base.execute(query), most_unpacked(self._size)
+        while block := rows.fetchmany(BLOCK):
+            left -= sum(len(data) for _, data in block)
+            if left < 0:
+                raise LimitError("holds more bytes in messages than any recording")
+            yield MessageBlock.of(*zip(*block, strict=True))
+
+    def close(self) -> None:
+        """Close the file."""
+        self._base.close()

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.arrays import FloatArray, Mask
-from slpi_ros.io.input_limits import MOST_AXES, require_count
+from slpi_ros.io.input_limits import MOST_AXES, LimitError, require_count
 
 ByteArray = NDArray[np.uint8]
 
@@ -81,7 +81,7 @@ class CdrReader:
     def __init__(self, data: bytes) -> None:
         order = BYTE_ORDERS.get(data[:2])
         if order is None:
-            raise struct.error("not plain CDR")
+            raise LimitError("messages that are not plain CDR, as ROS 2 writes them")
         self.order, self.data, self.at = order, data, ENCAPSULATION
         self._format = [order, "2s2x"]
         self._fixed = [(0, 2)]

@@ -1,10 +1,15 @@
 """Interpretation of column names (quantity, unit, axis) and choice of the columns of a record."""
 
+import math
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from typing import NoReturn
 
+import numpy as np
+
+from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.input_limits import MOST_AXES
 
@@ -77,6 +82,10 @@ _SPELLED = {
     **dict.fromkeys(("nanometer", "nanometers", "nanometre", "nanometres"), "nm"),
 }
 
+# Values of columns by name.
+Reader = Callable[[Sequence[str]], Mapping[str, FloatArray]]
+# Rows from which a line can be told from a loop; what is left beside a line is noise up to this multiple of its own.
+FEWEST_FOR_A_LINE, AS_NOISE = 20, 1.5
 # Word by which the name of a column says that its displacement is a desired one.
 _DESIRED = re.compile(r"(?<![^\W\d_])(?:desired|set[ _-]?point)(?![^\W\d_])", re.IGNORECASE)
 _INDEX_OF_A_MATRIX = re.compile(r"\((?:\d+,:|:,\d+)\)$")
@@ -191,9 +200,15 @@ def _axis(stem: str) -> str:
 
 
 def match_column(name: str, columns: Sequence[str]) -> str:
-    """Return `name` if it is a column, else the only column that equals it except for case; `name` if there is none."""
-    alike = [column for column in columns if column.casefold() == name.casefold()]
-    return alike[0] if len(alike) == 1 and name not in columns else name
+    """Return the column of this name, but for case and unit; `name` if there is none, or several."""
+    if name in columns:
+        return name
+    # A unit in a line of its own is no part of the name that people see.
+    for plain in (str.casefold, lambda column: column.casefold().rpartition(" [")[0]):
+        alike = [column for column in columns if plain(column) == name.casefold()]
+        if len(alike) == 1:
+            return alike[0]
+    return name
 
 
 def joined(names: Sequence[str]) -> str:
@@ -217,46 +232,77 @@ class ColumnOptions:
     displacement_unit: str | None = None
     axes: tuple[str, ...] = ()
     desired: tuple[str, ...] = ()
+    sample_period: float | None = None  # s, instead of a column of time
+    sensor_scale: float | None = None  # m for one unit of a column of displacement
+    amplifier_gain: float | None = None  # V at the stage for one unit of a column of voltage
+    names: tuple[str, ...] = ()  # of the columns of a text without a header
+    sheet: str | None = None  # of a workbook
+    group: str | None = None  # of a TDMS file
+
+    def __post_init__(self) -> None:
+        for name in ("sample_period", "sensor_scale", "amplifier_gain"):
+            value = getattr(self, name)
+            least = 1e-9 if name == "sample_period" else -math.inf
+            if value is not None and not (math.isfinite(value) and value != 0.0 and value >= least):
+                raise UsageError(f"--{name.replace('_', '-')} {value:g}: give a number that can be one")
+        if self.time and self.sample_period:
+            raise UsageError("--time and --sample-period: give one of them")
 
 
 @dataclass(frozen=True)
 class ColumnChoice:
     """The columns of a record; `voltage` and `displacement` have the same axes, `desired` some of them or none."""
 
-    time: Column
+    time: Column | None  # None: the rows have a period
     voltage: Mapping[str, Column]
     displacement: Mapping[str, Column]
     desired: Mapping[str, Column] = field(default_factory=dict)
     left_out: tuple[str, ...] = ()  # names of desired columns, each with the reason
+    monitors: tuple[str, ...] = ()  # columns in volts that are straight lines of the displacement
     quantities: tuple[str, ...] = ()  # columns of recorded quantities, named by their topics
     others: tuple[str, ...] = ()  # columns that are nothing of this
 
     def columns(self) -> tuple[Column, ...]:
         """Return all columns."""
-        return (self.time, *self.displacement.values(), *self.voltage.values(), *self.desired.values())
+        time = () if self.time is None else (self.time,)
+        return (*time, *self.displacement.values(), *self.voltage.values(), *self.desired.values())
 
 
-def choose_columns(names: Sequence[str], options: ColumnOptions, source: str) -> ColumnChoice:
-    """Choose the columns of a record among the `names` of all columns of the table, by option, else by name."""
+def choose_columns(
+    names: Sequence[str], options: ColumnOptions, source: str, read: Reader, *, period: bool = False
+) -> ColumnChoice:
+    """Choose the columns of a record among the `names` of all columns of the table, by option, else by name.
+
+    `read` returns the values of columns: of several in volts those that follow the displacement are told from the drive
+    by them. With a `period` of the rows there need be no column of time.
+    """
     given_unit = options.displacement_unit
     if given_unit is not None and not DISPLACEMENT.unit(given_unit):
         raise UsageError(f"no displacement unit '{given_unit}'; choose {', '.join(DISPLACEMENT.units)}")
-    time = parse_column(
-        match_column(options.time, names) if options.time else _time_column(names, source), TIME, source=source
-    )
-    moved_names = [match_column(name, names) for name in options.displacement] or _displacement_columns(names, source)
+    time_name = match_column(options.time, names) if options.time else _time_column(names, source, period)
+    time = parse_column(time_name, TIME, source=source) if time_name else None
+    moved_names = [match_column(name, names) for name in options.displacement]
+    moved_names = moved_names or _displacement_columns(names, options.voltage, source)
     if len(moved_names) > MOST_AXES:
         raise RecordError(
             f"{source}: {len(moved_names)} displacement columns, more than the {MOST_AXES} axes that a stage may have; "
-            "choose some (--displacement or displacement=)"
+            "choose some (--displacement)"
         )
-    moved = [parse_column(name, DISPLACEMENT, given_unit=given_unit, source=source) for name in moved_names]
-    driven_names = [match_column(name, names) for name in options.voltage] or _voltage_columns(
-        names, time, moved, source
-    )
-    driven = _one_for_each(moved, [parse_column(name, VOLTAGE, source=source) for name in driven_names], source)
+    if options.sensor_scale is None:
+        moved = [parse_column(name, DISPLACEMENT, given_unit=given_unit, source=source) for name in moved_names]
+    else:
+        moved = [_scaled(name, options.sensor_scale, "m") for name in moved_names]
+    driven_names = [match_column(name, names) for name in options.voltage]
+    monitors: tuple[str, ...] = ()
+    if not driven_names:
+        driven_names, monitors = _voltage_columns(names, time_name, moved, source, read)
+    if options.amplifier_gain is None:
+        driven = [parse_column(name, VOLTAGE, source=source) for name in driven_names]
+    else:
+        driven = [_scaled(name, options.amplifier_gain, "V") for name in driven_names]
+    driven = _one_for_each(moved, driven, source)
     axes = _axis_names(moved, options.axes, source)
-    taken = {time.name, *(column.name for column in (*moved, *driven))}
+    taken = {time_name, *(column.name for column in (*moved, *driven))}
     wanted_names, left_out = [match_column(name, names) for name in options.desired], dict[str, str]()
     for name in () if wanted_names else names:
         if name not in taken and is_desired(name):
@@ -268,8 +314,8 @@ def choose_columns(names: Sequence[str], options: ColumnOptions, source: str) ->
     wanted = [_parse_desired(name, given_unit, source) for name in wanted_names]
     desired, of_none = _of_axes(wanted, moved, axes, source, named=bool(options.desired))
     left_out |= {column.name: f"no axis '{column.axis}'" for column in of_none}
-    _require_one_role(time, (*moved, *desired.values()), driven, source)
-    used = {*taken, *(column.name for column in wanted)}
+    _require_one_role(time_name, (*moved, *desired.values()), driven, source)
+    used = {*taken, *monitors, *(column.name for column in wanted)}
     rest = [name for name in names if name and name not in used]
     return ColumnChoice(
         time=time,
@@ -277,47 +323,113 @@ def choose_columns(names: Sequence[str], options: ColumnOptions, source: str) ->
         displacement=dict(zip(axes, moved, strict=True)),
         desired=desired,
         left_out=tuple(f"'{name}': {reason}" for name, reason in left_out.items()),
+        monitors=monitors,
         quantities=tuple(name for name in rest if name.startswith("/")),
         others=tuple(name for name in rest if not name.startswith("/") and name not in left_out),
     )
 
 
-def _time_column(names: Sequence[str], source: str) -> str:
+def _scaled(name: str, scale: float, unit: str) -> Column:
+    """Return a column whose scale (SI value of one unit) is given."""
+    named = next((quantity for quantity in QUANTITIES if unit_in(name, quantity)), DISPLACEMENT)
+    return Column(name, axis_of(name, named), unit, scale, assumed=False)
+
+
+def times_in(names: Sequence[str]) -> list[str]:
+    """Return the columns that hold times by their names."""
     found = [n for n in names if begins(n, TIME) or (unit_in(n, TIME) and axis_of(n, TIME).casefold() == "t")]
+    with_unit = [n for n in names if unit_in(n, TIME) and not (begins(n, VOLTAGE) or begins(n, DISPLACEMENT))]
+    # LabVIEW's name of the column of time.
+    return found or (with_unit if len(with_unit) == 1 else [n for n in names if n.casefold() == "x_value"])
+
+
+def two_clocks(source: str, one: str, other: str, names: Sequence[str]) -> str:
+    """Return what is wrong with a table of two columns of time, and what to do."""
+    return (
+        f"{source}: two columns of time, '{one}' and '{other}', of two clocks; there is {joined(names)}; write the "
+        "rows of both one below the other, with one column of time and empty cells: the import aligns them"
+    )
+
+
+def _time_column(names: Sequence[str], source: str, period: bool) -> str:
+    """Return the column of time; "" if there is none and none is needed."""
+    found = times_in(names)
     with_unit = [name for name in found if unit_in(name, TIME)]
-    if not found:
-        _missing(names, source, TIME)
-    return "time_s" if "time_s" in found else (with_unit or found)[0]
+    if not found and not period:
+        _missing(names, source, TIME, "or give the sampling period (--sample-period)")
+    time = "time_s" if "time_s" in found else (with_unit or found or [""])[0]
+    if found.count(time) > 1:
+        raise RecordError(two_clocks(source, time, time, names))
+    return time
 
 
-def _displacement_columns(every: Sequence[str], source: str) -> list[str]:
-    names = [name for name in every if not is_desired(name)]
+def _displacement_columns(every: Sequence[str], driven: Sequence[str], source: str) -> list[str]:
+    names = [name for name in every if not is_desired(name) and name not in driven]
     for word in DISPLACEMENT.prefixes:
-        if found := [name for name in names if name.lower().startswith(word)]:
+        found = [name for name in names if name.lower().startswith(word)]
+        # A sensor may be recorded in volts, too.
+        if found := [name for name in found if not unit_in(name, VOLTAGE)] or found:
             return found
     lengths = [name for name in names if unit_in(name, DISPLACEMENT)]
-    driven = {axis_of(name, VOLTAGE).casefold() for name in names if unit_in(name, VOLTAGE)}
-    for axes in (driven, {"x", "y", "z"}):
+    axes_driven = {axis_of(name, VOLTAGE).casefold() for name in names if unit_in(name, VOLTAGE)}
+    for axes in (axes_driven, {"x", "y", "z"}):
         if found := [name for name in lengths if axis_of(name, DISPLACEMENT).casefold() in axes]:
             return found
-    _missing(every, source, DISPLACEMENT)
+    if len(lengths) == 1:
+        return lengths
+    _missing(every, source, DISPLACEMENT, "of a sensor's monitor in volts its scale, too (--sensor-scale)")
 
 
-def _voltage_columns(names: Sequence[str], time: Column, moved: Sequence[Column], source: str) -> list[str]:
-    """Return the voltage columns: one for each axis if the names match the axes one to one, else all."""
-    taken = {time.name, *(column.name for column in moved)}
+def _voltage_columns(
+    names: Sequence[str], time: str, moved: Sequence[Column], source: str, read: Reader
+) -> tuple[list[str], tuple[str, ...]]:
+    """Return the voltage columns, one for each axis or one for all, and those that are monitors of the sensor."""
+    taken = {time, *(column.name for column in moved)}
     found = [n for n in names if n not in taken and (begins(n, VOLTAGE) or unit_in(n, VOLTAGE))]
+    found = found or [n for n in names if n not in taken and VOLTAGE.name in n.casefold()]
     if not found:
         _missing(names, source, VOLTAGE)
-    axes = [axis_of(n, VOLTAGE).casefold() for n in found]
-    of_axes = [[n for n, axis in zip(found, axes, strict=True) if axis == m.axis.casefold()] for m in moved]
-    return [names[0] for names in of_axes] if all(len(names) == 1 for names in of_axes) else found
+    monitors: tuple[str, ...] = ()
+    if len(found) > 1:
+        values: Mapping[str, FloatArray] = {}
+        with suppress(RecordError):
+            values = read([*found, *(column.name for column in moved)])
+        monitors = tuple(n for n in values if n in found and any(is_line(values[n], values[m.name]) for m in moved))
+        if len(monitors) < len(found):
+            found = [n for n in found if n not in monitors]
+        else:
+            monitors = ()
+    # A name that is of another quantity names no axis.
+    own = {n: _split(n, VOLTAGE)[0].strip(" \t_.-,/").casefold() for n in found if not begins(n, DISPLACEMENT)}
+    of_axes = [[n for n, stem in own.items() if _axis(stem) == m.axis.casefold() and stem] for m in moved]
+    if len(found) > 1 and len(moved) > 1 and all(len(matching) == 1 for matching in of_axes):
+        return [matching[0] for matching in of_axes], monitors
+    if len(found) > 1 and (len(moved) == 1 or len(found) == len(moved)):
+        raise RecordError(
+            f"{source}: {len(found)} columns in volts ({joined(found)}), of which one may be a monitor of the sensor; "
+            f"name the drive{' of each axis' if len(moved) > 1 else ''} (--voltage)"
+        )
+    return found, monitors
 
 
-def _missing(names: Sequence[str], source: str, quantity: ColumnQuantity) -> NoReturn:
-    option = quantity.name
+def is_line(x: FloatArray, y: FloatArray, fewest: int = FEWEST_FOR_A_LINE) -> bool:
+    """Return whether one signal is a straight line of the other, both (N,): what is left is noise, or digits."""
+    both = np.isfinite(x) & np.isfinite(y)
+    x, y = x[both], y[both]
+    if x.size < fewest or not (np.ptp(x) and np.ptp(y)):
+        return False
+    x, y = (x - x.mean()) / np.std(x), (y - y.mean()) / np.std(y)
+    rest = y - np.mean(x * y) * x
+    steps = [np.diff(np.unique(signal)) for signal in (x, y)]
+    digits = max(float(step.min()) for step in steps)
+    # A loop of hysteresis changes little from row to row; noise does, and digits are as large as they are.
+    return float(np.std(rest)) <= max(AS_NOISE * float(np.std(np.diff(rest))) / 2**0.5, digits)
+
+
+def _missing(names: Sequence[str], source: str, quantity: ColumnQuantity, also: str = "") -> NoReturn:
     raise RecordError(
-        f"{source}: no {option} column; there is {joined(names)}; name one of them (--{option} or {option}=)"
+        f"{source}: no {quantity.name} column; there is {joined([name for name in names if name])}; name one of them "
+        f"(--{quantity.name}){', ' if also else ''}{also}"
     )
 
 
@@ -328,7 +440,7 @@ def _one_for_each(moved: Sequence[Column], driven: Sequence[Column], source: str
     if len(driven) != len(moved):
         raise RecordError(
             f"{source}: {len(driven)} voltage columns ({_column_names(driven)}) for {len(moved)} of displacement "
-            f"({_column_names(moved)}); name one voltage for all or one for each (--voltage or voltage=)"
+            f"({_column_names(moved)}); name one voltage for all or one for each (--voltage)"
         )
     return [*driven]
 
@@ -367,14 +479,14 @@ def _axis_names(moved: Sequence[Column], axes: Sequence[str], source: str) -> tu
     if len(set(names)) < len(names):
         raise RecordError(
             f"{source}: displacement columns {_column_names(moved)} are axes {', '.join(names)}, two of them the "
-            "same; choose the columns (--displacement or displacement=)"
+            "same; choose the columns (--displacement)"
         )
     return names
 
 
-def _require_one_role(time: Column, moved: Sequence[Column], driven: Iterable[Column], source: str) -> None:
+def _require_one_role(time: str, moved: Sequence[Column], driven: Iterable[Column], source: str) -> None:
     """Raise UsageError if a column has more than one role; one voltage column may serve several axes."""
-    names = [time.name, *(column.name for column in moved), *{column.name for column in driven}]
+    names = [time, *(column.name for column in moved), *{column.name for column in driven}]
     for name in names:
         if names.count(name) > 1:
             raise UsageError(

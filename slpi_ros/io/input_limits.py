@@ -9,8 +9,10 @@ import errno
 import os
 import stat
 from collections.abc import Iterable
+from io import BytesIO
 from pathlib import Path
 from typing import BinaryIO
+from zipfile import ZipFile
 
 MIB = 2**20
 
@@ -93,6 +95,13 @@ def require_count(count: int, most: int, what: str) -> None:
     """Raise LimitError if there are more than `most` of something, which `what` names."""
     if count > most:
         raise LimitError(f"{count} {what}, more than {most}")
+
+
+def require_unpacked(packed: bytes) -> None:
+    """Raise LimitError if the files in a ZIP archive are larger than `most_unpacked`; any exception if damaged."""
+    with ZipFile(BytesIO(packed)) as archive:
+        if sum(file.file_size for file in archive.infolist()) > min(ARRAY_BYTES, most_unpacked(len(packed))):
+            raise LimitError("unpacks to more than any record")
 
 
 def _require(found: os.stat_result, most: int) -> None:

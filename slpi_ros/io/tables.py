@@ -3,22 +3,39 @@
 import csv
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from io import StringIO
 from pathlib import Path
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray, IntArray
-from slpi_ros.errors import RecordError
+from slpi_ros.errors import DependencyError, RecordError, dependencies_needed
+from slpi_ros.io.alignment import between
+from slpi_ros.io.array_files import HDF5, TDMS, ZIP, load_arrays
 from slpi_ros.io.atomic_file import all_or_nothing
-from slpi_ros.io.columns import Column, ColumnChoice, ColumnOptions, choose_columns, match_column
-from slpi_ros.io.input_limits import MOST_AXES
+from slpi_ros.io.columns import (
+    TIME,
+    Column,
+    ColumnChoice,
+    ColumnOptions,
+    choose_columns,
+    is_line,
+    joined,
+    match_column,
+    parse_column,
+    times_in,
+    two_clocks,
+)
+from slpi_ros.io.input_limits import MOST_AXES, TABLE_BYTES, open_input
 from slpi_ros.io.record import Course, Record
-from slpi_ros.io.table_files import CsvTable, MatTable, load_csv, load_mat
+from slpi_ros.io.table_files import Table, load_spreadsheet, load_text
 
 # message stamps count seconds in int32
 _TIME_END = 2.0**31
+# Of a time without a unit, the seconds of one unit by the size of the first value: ms, us or ns since 1970.
+_SINCE_1970 = ((1e17, "ns"), (1e14, "us"), (1e11, "ms"))
+_OLD_WORKBOOK = b"\xd0\xcf\x11\xe0"
 
 
 def import_table(
@@ -31,14 +48,35 @@ def import_table(
     axes: Sequence[str] = (),
 ) -> Record:
     """Import measured data (V, m) from a table, identifying columns and units by name or option."""
-    # The table is a text file with a line of column names above the numbers, separated by comma, semicolon or tab; with
-    # semicolon or tab, decimal commas are allowed. Or it is a MATLAB file (``.mat``, up to version 7), whose numeric
-    # vectors are the columns. A column name may contain a unit; without, units are seconds, volts and
-    # `displacement_unit`, by default micrometres. Columns named by a topic, such as ``/room/temperature``, are recorded
-    # quantities; other ones are left out. Empty cells and ``nan`` become NaN. If the first time is negative,
-    # all times are shifted such that the record begins at 0.
+    # The table is a text, a spreadsheet, or a file of arrays, see `load_table`. A column name may contain a unit;
+    # without, units are seconds, volts and `displacement_unit`, by default micrometres. Columns named by a topic, such
+    # as ``/room/temperature``, are recorded quantities; other ones are left out. Empty cells and ``nan`` become NaN. If
+    # the first time is negative or no stamp of a message, all times are shifted such that the record begins at 0.
     options = ColumnOptions(time, tuple(voltage), tuple(displacement), displacement_unit, tuple(axes))
     return import_with_summary(path, options).record
+
+
+def load_table(path: Path, options: ColumnOptions | None = None) -> Table:
+    """Find the columns of a table by the content of its file; DependencyError if its library is missing."""
+    given = options or ColumnOptions()
+    try:
+        with open_input(path, TABLE_BYTES) as file:
+            begin = file.read(8)
+    except OSError:
+        begin = b""
+    suffix = path.suffix.lower()
+    if begin.startswith(_OLD_WORKBOOK):
+        raise RecordError(f"{path}: a workbook of an old Excel; save it as .xlsx or CSV")
+    try:
+        with dependencies_needed():
+            if suffix in (".mat", ".npz") or begin.startswith((HDF5, TDMS)):
+                return load_arrays(path, begin, given.group)
+            if begin.startswith(ZIP):
+                return load_spreadsheet(path, given.names, given.sheet)
+    except DependencyError as error:
+        kind = "a file of HDF5, as of MATLAB 7.3: " if "h5py" in str(error) else ""
+        raise DependencyError(f"{path}: {kind}{error}; or save it as text, or from MATLAB by -v7") from error
+    return load_text(path, given.names)
 
 
 @dataclass(frozen=True)
@@ -53,20 +91,86 @@ class Imported:
 def import_with_summary(path: str | os.PathLike[str], options: ColumnOptions) -> Imported:
     """Import a table as `import_table` does, with desired displacements and a summary by axis."""
     path = Path(path)
-    table = load_mat(path) if path.suffix.lower() == ".mat" else load_csv(path)
-    choice = choose_columns(table.columns, options, str(path))
-    values = table.read([*(column.name for column in choice.columns()), *choice.quantities])
-    time_ns = _nanoseconds(_si(values, choice.time), choice.time.name, table)
+    table = load_table(path, options)
+    period = options.sample_period or table.period
+    # Of a sampling period in the place of times there is one value.
+    choice = choose_columns(table.columns, options, str(path), table.read, period=bool(period))
+    wanted = [*(column.name for column in choice.columns()), *choice.quantities]
+    said = []
+    if choice.time and options.sample_period is None and (single := table.single(choice.time.name)) is not None:
+        period, choice = single * choice.time.scale, replace(choice, time=None)
+        wanted.pop(0)
+    values = table.read(wanted)
+    if choice.time and table.period and np.isnan(values[choice.time.name]).all():
+        choice = replace(choice, time=None)
+    if choice.time is None or options.sample_period:
+        assert period is not None
+        time_ns = np.rint(np.arange(values[wanted[-1]].size) * (period * 1e9)).astype(np.int64)
+        said.append(f"time: a row every {period:g} s")
+    else:
+        _require_one_clock(table, choice, choice.time, values[choice.time.name])
+        time, seconds = _in_seconds(choice.time, values[choice.time.name])
+        if table.holds_dates(time.name):
+            time, seconds = replace(time, assumed=False), values[time.name]
+            said.append(f"time: '{time.name}' in seconds from its first row on")
+        choice = replace(choice, time=time)
+        time_ns = _nanoseconds(seconds, time.name, table)
+        if time_ns[0] == 0 and seconds[0] > 0.0:
+            said.append(f"time: counts from {seconds[0]:.12g} s on; the record begins at 0")
     t = (time_ns - time_ns[0]) * 1e-9
+    voltage = {axis: _si(values, column) for axis, column in choice.voltage.items()}
+    displacement = {axis: _si(values, column) for axis, column in choice.displacement.items()}
+    for axis, y in displacement.items():
+        voltage[axis], aligned = _on_rows_of(y, voltage[axis], t)
+        if aligned:
+            said.append(f"axis {axis}: rows of two clocks; the voltage was interpolated to those of the displacement")
     record = Record(
         time_ns=time_ns,
-        voltage={axis: _si(values, column) for axis, column in choice.voltage.items()},
-        displacement={axis: _si(values, column) for axis, column in choice.displacement.items()},
+        voltage=voltage,
+        displacement=displacement,
         source=str(path),
         surroundings={name: _readings(t, values[name]) for name in choice.quantities},
     )
+    if table.left_out:
+        said.append(f"left out, no columns of numbers: {joined(table.left_out)}")
     desired = {axis: _si(values, column) for axis, column in choice.desired.items()}
-    return Imported(record, desired, tuple(_summary(record, desired, choice)))
+    return Imported(record, desired, (*_summary(record, desired, choice), *said))
+
+
+def _in_seconds(column: Column, values: FloatArray) -> tuple[Column, FloatArray]:
+    """Return a column of time and its values in seconds; a unit that its name does not tell is that of a date."""
+    if column.assumed and (unit := next((unit for least, unit in _SINCE_1970 if values[0] >= least), "")):
+        column = replace(column, unit=unit, scale=TIME.units[unit])
+    return column, values * column.scale
+
+
+def _require_one_clock(table: Table, choice: ColumnChoice, time: Column, own: FloatArray) -> None:
+    """Raise RecordError if the table has another column of times that are not those of the first one."""
+    for name in times_in(choice.others):
+        try:
+            column, values = parse_column(name, TIME), table.read([name])[name]
+        except RecordError:
+            continue
+        known = np.isfinite(own) & np.isfinite(values)
+        first, other = own[known] * time.scale, values[known] * column.scale
+        if not (np.diff(other) > 0.0).all():
+            # What does not run forward is no time.
+            continue
+        # Another clock of the same rows shows other times by a constant; of an unknown unit it shows a straight line.
+        apart = np.ptp(other - first) > 0.5 * np.median(np.diff(first))
+        if apart and not (column.assumed and is_line(first, other, fewest=2)):
+            raise RecordError(two_clocks(str(table.path), time.name, name, table.columns))
+
+
+def _on_rows_of(y: FloatArray, v: FloatArray, t: FloatArray) -> tuple[FloatArray, bool]:
+    """Return voltages (V) that are known where the displacements `y` are, if they stand in rows of their own."""
+    moved, driven = np.isfinite(y), np.isfinite(v)
+    if np.count_nonzero(moved & driven) >= np.count_nonzero(moved) // 2 or np.count_nonzero(driven) < 2:
+        return v, False
+    filled, known = v.copy(), t[driven]
+    at = moved & ~driven & (t >= known[0]) & (t <= known[-1])
+    filled[at] = between(t[at], known, v[driven])
+    return filled, True
 
 
 def _readings(t: FloatArray, values: FloatArray) -> Course:
@@ -81,7 +185,7 @@ def _si(values: Mapping[str, FloatArray], column: Column) -> FloatArray:
 
 def _summary(record: Record, desired: Mapping[str, FloatArray], choice: ColumnChoice) -> Iterable[str]:
     """Yield a line for each axis, one for time if its unit was assumed, and one for each desired column left out."""
-    if choice.time.assumed:
+    if choice.time and choice.time.assumed:
         yield f"time: column '{choice.time.name}' taken as {choice.time.unit}"
     for axis in record.axes:
         voltage = _column_summary(choice.voltage[axis], record.voltage[axis], "V")
@@ -90,6 +194,8 @@ def _summary(record: Record, desired: Mapping[str, FloatArray], choice: ColumnCh
         yield f"axis {axis}: {voltage}, {displacement}{', desired ' + wanted if wanted else ''}"
     for name, (_, readings) in record.surroundings.items():
         yield f"quantity {name}: {readings.size} readings"
+    for name in choice.monitors:
+        yield f"left out, '{name}': a straight line of the displacement, so a monitor of the sensor"
     for reason in choice.left_out:
         yield f"left out, column {reason}; name the columns of desired displacements in units of length (--desired)"
     if choice.others:
@@ -120,12 +226,15 @@ def read_table_with(
     """Read times (s), finite values (V or m) by axis, and quantities by name, (N,) each, from a table of a command."""
     # The columns are ``time_s``, ``<axis>_<suffix>``, "V" or "m", and of `beside` those that are there, in any order;
     # others are ignored. A quantity is held where its cells are empty.
-    table = load_csv(Path(path))
+    table = load_table(Path(path))
     ending = _ending(suffix)
     own = [name for name in table.columns if name not in beside]
     columns = {n.removesuffix(ending): n for n in own if n.endswith(ending) and n != ending}
     if not columns:
-        raise RecordError(f"{path}: no column <axis>{ending}; there is {table.listing()}")
+        raise RecordError(
+            f"{path}: no column <axis>{ending}; there is {table.listing()}; write such names above the columns, or "
+            f"make a bag of a measured record: slpi import {path} -o BAG"
+        )
     if len(columns) > MOST_AXES:
         raise RecordError(f"{path}: {len(columns)} columns <axis>{ending}, more than {MOST_AXES} axes; leave some out")
     time = match_column("time_s", table.columns)
@@ -177,15 +286,16 @@ def _ending(suffix: str) -> str:
     return f"_{suffix.strip('_')}"
 
 
-def _nanoseconds(seconds: FloatArray, column: str, table: CsvTable | MatTable) -> IntArray:
-    """Return time stamps (ns); if the first time is negative, all are shifted to start at 0, as messages require."""
+def _nanoseconds(seconds: FloatArray, column: str, table: Table) -> IntArray:
+    """Return time stamps (ns); if the first time is no stamp of a message, all are shifted to start at 0."""
     table.require(np.isfinite(seconds), column, seconds, "every row needs a time")
-    table.require(np.abs(seconds) < _TIME_END, column, seconds, "more than 2^31 s; is the unit right?")
+    table.require(np.abs(seconds - seconds[0]) < _TIME_END, column, seconds, "more than 2^31 s; is the unit right?")
     _require_order(seconds, column, table)
-    stamps: IntArray = np.rint((seconds - min(seconds[0], 0.0)) * 1e9).astype(np.int64)
+    begins = seconds[0] if not 0.0 <= seconds[0] < _TIME_END else 0.0
+    stamps: IntArray = np.rint((seconds - begins) * 1e9).astype(np.int64)
     return stamps
 
 
-def _require_order(seconds: FloatArray, column: str, table: CsvTable | MatTable) -> None:
+def _require_order(seconds: FloatArray, column: str, table: Table) -> None:
     forward = np.concatenate([[True], np.diff(seconds) >= 0])
     table.require(forward, column, seconds, "time runs backwards here; sort or cut the table")

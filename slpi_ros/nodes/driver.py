@@ -329,6 +329,10 @@ class Driver(Node):
                        f"{1e3 / self._values['rate']:.3g} ms; set rate to {cycles / elapsed:.0f} or less, or set "
                        "realtime_priority")
             )  # fmt: skip
+        for axis, rows in zip(self._limits, loop.recent.rows(), strict=False):
+            if rows > 1.0:
+                rate = f"{cycles / elapsed / rows:.3g} readings a second, each for {rows:.3g} cycles"
+                problems.append((WARN, f"the sensor of axis '{axis}' is slower than the cycle: {rate}"))
         timing = loop.timing.report()
         values: dict[str, object] = {
             "state": status.state.value,

@@ -246,7 +246,8 @@ def record_notes(record: RecordVerification) -> list[str]:
     if not record.independent:
         notes.append("the model was identified from this bag: a small error on it proves nothing")
     if not record.passed:
-        notes.append(f"relative to the model, gain {record.gain:+z.2%}, loop width {record.width:+z.2%}")
+        width = f"{record.width:+z.2%}" if record.width > -1.0 else "of no loop that a stage has"
+        notes.append(f"relative to the model, gain {record.gain:+z.2%}, loop width {width}")
     if record.beyond:
         notes.append(f"{record.beyond}: the model extrapolates there")
     return notes

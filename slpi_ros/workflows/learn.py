@@ -10,6 +10,7 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.identification.held_readings import without_held
 from slpi_ros.io.desired import DesiredPath, at_times, read_desired
 from slpi_ros.io.record import Record
 from slpi_ros.learning.axis_learner import MOST_REFUSED, PassReport
@@ -189,7 +190,8 @@ def _taken(learner: Learner, record: Record, begun: _Begun) -> list[LearnedPass]
     begin = (begun.start_ns - int(record.time_ns[0])) * 1e-9
     if begin < -1e-6 or begin + float(t[-1]) > (int(record.time_ns[-1]) - int(record.time_ns[0])) * 1e-9 + 1e-6:
         return []
-    measured = {axis: _at(record, record.displacement[axis], begin + t, duration / t.size) for axis in learner.axes}
+    fresh = {axis: without_held(record, axis)[0].displacement[axis] for axis in learner.axes}
+    measured = {axis: _at(record, fresh[axis], begin + t, duration / t.size) for axis in learner.axes}
     voltage = {axis: _at(record, record.voltage[axis], begin + t, math.inf) for axis in learner.axes}
     followed = None
     if begun.asked is not None:

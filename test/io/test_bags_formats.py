@@ -14,7 +14,7 @@ from refusals import holds, refusal
 
 from slpi_ros.errors import RecordError
 from slpi_ros.io.bag_reader import read_bag
-from slpi_ros.io.bag_storage import read_mcap
+from slpi_ros.io.bag_storage import McapFile
 from slpi_ros.io.record import OUT_OF_ORDER
 
 COUNT = 900
@@ -166,7 +166,10 @@ def test_every_message_of_a_topic_byte_by_byte(tmp_path_factory, rows, data):
         use_chunking=data.draw(st.booleans()),
         index_types=data.draw(st.sampled_from([IndexType.ALL, IndexType.CHUNK])),
     )
-    read = [pair for b in read_mcap(file, "/a") for pair in zip(b.logged.tolist(), b.each(), strict=True)]
+    with file.open("rb") as stream:
+        bag = McapFile(stream)
+        wanted = {each.number for each in bag.connections if each.topic == "/a"}
+        read = [pair for b in bag.blocks(wanted) for pair in zip(b.logged.tolist(), b.each(), strict=True)]
     assert read == [(logged, message) for topic, logged, message in rows if topic == "a"]
 
 

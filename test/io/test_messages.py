@@ -54,11 +54,13 @@ def test_encoded_as_rosbags_does(names, frame_id, stamp, data):
 def test_all_at_once_agrees_with_one_by_one(names, frame_id, velocities, data):
     given_rows = st.lists(numbers, min_size=len(names), max_size=len(names))
     drawn = data.draw(st.lists(st.tuples(stamps, given_rows, given_rows), min_size=1, max_size=5))
+    # In order, each with a stamp of its own: what else becomes of them is that of `message_order`.
+    drawn = [(10**12 + 7 * number + t % 7, p, e) for number, (t, p, e) in enumerate(drawn)]
     messages = [serialised(t, names, p, e, frame_id, [1.0] * velocities) for t, p, e in drawn]
     assert read_message(messages[0], JOINT_STATE).layout.decode(rows(*messages)) is not None
     alike = decode(*messages)
     # one more message of another length leaves only the slow way
-    each = decode(*messages, serialised(1, [*names, "one more"], [], []))
+    each = decode(*messages, serialised(2 * 10**12, [*names, "one more"], [], []))
     assert alike.frame_id == frame_id
     stamp = np.zeros(len(drawn)) if alike.stamp is None else alike.stamp
     assert stamp.tolist() == each.stamp[:-1].tolist() == [stamp for stamp, _, _ in drawn]

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from refusals import holds, refusal
 
 from slpi_ros.errors import RecordError
-from slpi_ros.io.table_files import load_csv
+from slpi_ros.io.table_files import load_text
 from slpi_ros.io.tables import import_table, read_table
 
 ROWS = ((0.0, 1.5, -2.25), (0.5, 2.0, 3e-3), (1.0, -2.5, 4.0))
@@ -45,7 +45,10 @@ def is_told(path) -> None:
 
 
 @pytest.mark.parametrize("encoding", ENCODINGS)
-@pytest.mark.parametrize(("separator", "comma"), [(",", False), (";", False), (";", True), ("\t", False), ("\t", True)])
+@pytest.mark.parametrize(
+    ("separator", "comma"),
+    [(",", False), (";", False), (";", True), ("\t", False), ("\t", True), ("|", False), ("  ", False), ("   ", True)],
+)
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
 def test_separator_decimal_mark_encoding(table, separator, comma, encoding, end):
     is_told(table(told(separator, comma, end=end), encoding))
@@ -109,7 +112,7 @@ def test_decimal_comma_needs_another_separator(table):
     assert holds(refusal(RecordError, import_table, path), path, "line 2", 6, 3)
 
 
-@pytest.mark.parametrize("text", ["A title\nand another\n", "only|bars\n1|2\n3|4\n", "names\n1\n2\n"])
+@pytest.mark.parametrize("text", ["A title\nand another\n", "only!bars\n1!2\n3!4\n", "names\n1\n2\n"])
 def test_no_header_is_told_in_one_line(table, text):
     path = table(text)
     message = refusal(RecordError, import_table, path)
@@ -148,7 +151,7 @@ def test_what_python_writes_is_read(tmp_path_factory, names, separator, values):
     csv.writer(text, delimiter=separator, quoting=csv.QUOTE_ALL).writerows([names, *([v] * len(names) for v in values)])
     path = tmp_path_factory.getbasetemp() / "written.csv"
     path.write_bytes(text.getvalue().encode())
-    read = load_csv(path)
+    read = load_text(path)
     assert read.columns == tuple(names)
     for column in read.read(names).values():
         assert column.tolist() == values

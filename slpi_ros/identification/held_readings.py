@@ -1,0 +1,156 @@
+"""Readings of a sensor that is slower than its record: each one repeated until the next (sample and hold)."""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.special import ndtr
+
+from slpi_ros.arrays import FloatArray, Mask
+from slpi_ros.identification.bad_readings import after_jumps
+from slpi_ros.identification.signal_statistics import FEWEST, digit, median_rms, spread
+from slpi_ros.io.record import Record
+
+# Share of repeated rows, beyond those that are equal by their digits, from which readings are held: one row in three
+# where a sensor's readings last for one or two rows.
+
+HELD = 0.3
+# Log-likelihood of the held readings above that of fresh ones, for each change of the readings.
+_BETTER = 0.7
+# Share of changes by more than one digit below which it makes no difference whether readings are held.
+_ABOVE = 0.1
+# Rows that are compared.
+_ENOUGH = 40_000
+# Rows on either side from which the speed is taken: this many readings, and limits.
+_READINGS, _LEAST, _MOST = 3, 4, 20_000
+# Standard deviations of the noise, in digits, and shares of repeated rows that are tried.
+_NOISES = np.geomspace(0.02, 3e3, 40)
+_SHARES = np.concatenate([np.arange(0.0, 0.9, 0.1), 1.0 - np.geomspace(0.1, 1e-3, 14)])
+# Probability of what is none of noise.
+_ELSE = 1e-4
+# A jump is larger than this multiple of what the voltage usually changes.
+_JUMP = 5.0
+# Resolution of readings without digits, as a share of their usual change.
+_CONTINUOUS = 1e-3
+
+
+@dataclass(frozen=True)
+class Held:
+    """Which readings of a displacement, (N,), are fresh, and the mean number of rows for which each one is held."""
+
+    fresh: Mask
+    rows: float  # 1: none is held
+
+    @property
+    def found(self) -> bool:
+        """Whether readings are held."""
+        return self.rows > 1.0
+
+
+def held_readings(y: FloatArray, v: FloatArray) -> Held:
+    """Find the readings of a displacement (m) that are fresh, at voltages (V), both finite, of shape (N,).
+
+    Equal readings in a row also come from coarse digits. Two explanations of all changes from row to row are compared
+    by their likelihood: fresh readings with noise and digits, of a stage that moves at its speed; or readings of which
+    a share repeats the one before, so that a change follows all of the motion since the last one.
+    """
+    none = Held(np.ones(y.size, dtype=bool), 1.0)
+    same = y[1:] == y[:-1]
+    at = np.flatnonzero(~same)
+    if y.size < FEWEST or at.size < FEWEST // 4 or np.count_nonzero(same) <= HELD * same.size or not np.ptp(v):
+        return none
+    rows = same.size / at.size
+    step = digit(y) or _CONTINUOUS * median_rms(y[at + 1] - y[at])
+    gain = spread(y) / spread(v)
+    driven, ways = gain / step * np.diff(v), _speeds(y, round(_READINGS * rows)) / step
+    slowest = np.where(np.abs(driven) < np.abs(ways), driven, ways)
+    # What is near a jump of the voltage says nothing; nor does a stage at rest.
+    jump = _JUMP * float(np.quantile(np.abs(np.diff(v)), 0.9))
+    judged = ~(after_jumps(v, jump)[1:] | after_jumps(v[::-1], jump)[:0:-1]) & (slowest != 0.0)
+    judged[: at[0] + 1] = False
+    way = np.concatenate([[0.0], np.cumsum(ways)])
+    before = at[np.maximum(np.cumsum(~same) - ~same - 1, 0)]
+    since = way[1:] - way[before + 1]
+    chosen = np.flatnonzero(judged)
+    chosen = chosen[:: max(1, chosen.size // _ENOUGH)]
+    equal, changed = chosen[same[chosen]], chosen[~same[chosen]]
+    if changed.size < FEWEST // 4:
+        return none
+    sizes = (y[changed + 1] - y[changed]) / step
+    if np.mean(np.abs(sizes) > 1.5) < _ABOVE:
+        return none
+    # Neither speed is exact: the one counts that a fresh reading goes with better.
+    nothing = np.zeros(equal.size)
+    fresh = [
+        _told(nothing, slowest[equal], noise) + _told(sizes, driven[changed], noise, ways[changed]) for noise in _NOISES
+    ]
+    best, share = max(_best_share(since[equal], sizes, since[changed], noise) for noise in _NOISES)
+    if share < HELD or best - max(fresh) < _BETTER * changed.size:
+        return none
+    # A run that is longer than usual is of several readings with the same digits.
+    runs = changed - before[changed]
+    return _with_fresh(y, float(np.mean(runs[runs <= max(1.5 * np.median(runs), 2.0)])))
+
+
+def _with_fresh(y: FloatArray, rows: float) -> Held:
+    """Return the fresh readings where each one is held for some rows."""
+    at = np.arange(y.size)
+    new = np.diff(y, prepend=np.nan) != 0.0
+    # What stays equal for longer was read anew, with the same digits.
+    age = at - np.maximum.accumulate(np.where(new, at, 0))
+    again = (np.floor(age / rows) > np.floor((age - 1) / rows)) & (age >= 1.5 * rows)
+    return Held(new | again, rows)
+
+
+def without_held(record: Record, axis: str) -> tuple[Record, float]:
+    """Return a record whose held readings of an axis are missing, and the rows for which each one is held."""
+    v, y = record.voltage[axis], record.displacement[axis]
+    known = np.flatnonzero(np.isfinite(v) & np.isfinite(y))
+    found = held_readings(y[known], v[known])
+    if not found.found:
+        return record, 1.0
+    fresh = y.copy()
+    fresh[known[~found.fresh]] = np.nan
+    return replace(record, displacement={**record.displacement, axis: fresh}), found.rows
+
+
+def _speeds(y: FloatArray, rows: int) -> FloatArray:
+    """Return the mean change of readings, (N,), from row to row over some rows on either side, (N - 1,)."""
+    reach = int(np.clip(rows, _LEAST, _MOST))
+    first = np.maximum(np.arange(y.size - 1) - reach, 0)
+    last = np.minimum(np.arange(1, y.size) + reach, y.size - 1)
+    return np.asarray((y[last] - y[first]) / (last - first))
+
+
+def _probability(size: FloatArray, moved: FloatArray, noise: float) -> FloatArray:
+    """Return the probability of changes between two readings with noise, after a motion; in digits, (N,) each."""
+    # A digit is a uniform error of each reading, so that of two of them is triangular.
+    scale = np.sqrt(2.0) * noise
+    far, middle, near = (_integral(size + offset - moved, scale) for offset in (1.0, 0.0, -1.0))
+    return np.asarray(np.clip(far - 2.0 * middle + near, 0.0, 1.0))
+
+
+def _integral(x: FloatArray, scale: float) -> FloatArray:
+    """Return the integral of the normal distribution with a standard deviation up to `x`, (N,)."""
+    z = x / scale
+    return np.asarray(x * ndtr(z) + scale * np.exp(-0.5 * z**2) / np.sqrt(2.0 * np.pi))
+
+
+def _told(size: FloatArray, moved: FloatArray, noise: float, other: FloatArray | None = None) -> float:
+    """Return the log-likelihood of changes after motions, or others, all in digits, (N,)."""
+    likely = _probability(size, moved, noise)
+    if other is not None:
+        likely = np.maximum(likely, _probability(size, other, noise))
+    return float(np.sum(np.log(likely + _ELSE)))
+
+
+def _best_share(still: FloatArray, sizes: FloatArray, since: FloatArray, noise: float) -> tuple[float, float]:
+    """Return the largest log-likelihood, and its share, of no change after motions (M,) and of changes (K,)."""
+    by_chance = _probability(np.zeros(still.size), still, noise)
+    changes = _told(sizes, since, noise)
+    return max(
+        (
+            float(np.sum(np.log(share + (1.0 - share) * by_chance + _ELSE))) + changes + sizes.size * np.log1p(-share),
+            share,
+        )
+        for share in _SHARES.tolist()
+    )

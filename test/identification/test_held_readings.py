@@ -1,0 +1,114 @@
+"""A sensor slower than its record: recognised from the data, at its rate, and only its fresh readings are used."""
+
+import numpy as np
+import pytest
+from refusals import holds
+
+import slpi_ros
+from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.hysteresis.turning_points import Memory
+from slpi_ros.identification.held_readings import held_readings, without_held
+from slpi_ros.io.record import Record
+
+RADII = np.linspace(0.0, 40.0, 12)
+STAGE = PrandtlIshlinskii(RADII, np.concatenate([[1e-7], 6e-8 * np.exp(-RADII[1:] / 15.0)]))
+
+
+def drive(rng, rate, seconds, speed=120.0):
+    """Return times (s) and voltages (V): over the whole range, then turns anywhere."""
+    t = np.arange(int(rate * seconds)) / rate
+    turns = np.concatenate([[0.0, 100.0, 0.0], rng.uniform(0.0, 100.0, 400)])
+    return t, np.interp(t, np.concatenate([[0.0], np.cumsum(np.abs(np.diff(turns)) / speed)]), turns)
+
+
+def readings(rng, v, noise, digits):
+    y = (
+        Memory(STAGE, 0.0).forward_array(v) + rng.normal(0.0, noise, v.size)
+        if noise
+        else Memory(STAGE, 0.0).forward_array(v)
+    )
+    return np.round(y / digits) * digits if digits else y
+
+
+def held(rng, y, rows, jitter):
+    """Return readings that are repeated for some rows, on average, and which of them are new."""
+    least, most = (max(1, rows - rows // 2), rows + rows // 2) if jitter else (rows, rows)
+    starts = np.cumsum(np.concatenate([[0], rng.integers(least, most + 1, y.size)]))
+    starts = starts[starts < y.size]
+    new = np.zeros(y.size, dtype=bool)
+    new[starts] = True
+    return y[starts[np.searchsorted(starts, np.arange(y.size), side="right") - 1]], new
+
+
+def record(t, v, y):
+    return Record(np.rint(t * 1e9).astype(np.int64), {"x": v}, {"x": y}, "a record")
+
+
+@pytest.mark.parametrize("jitter", [False, True])
+@pytest.mark.parametrize("digits", [0.0, 1e-9, 1e-8])
+@pytest.mark.parametrize(("rate", "seconds"), [(1000, 15.0), (10_000, 3.0)])
+def test_held_readings_are_found_with_their_rate(rate, seconds, digits, jitter):
+    rng = np.random.default_rng(3)
+    t, v = drive(rng, rate, seconds)
+    y = readings(rng, v, 8e-9, digits)
+    # Within two rows a slow stage moves by less than a digit.
+    for rows in (2, 3, 5, 10, 20) if rate * digits < 1e-4 else (3, 5, 10, 20):
+        shown, new = held(rng, y, rows, jitter)
+        found = held_readings(shown, v)
+        assert found.rows == pytest.approx(t.size / np.count_nonzero(new), rel=0.15), rows
+        # What is used is what the sensor said then, within what digits hide.
+        assert not np.any(found.fresh & ~new & (np.diff(shown, prepend=np.nan) != 0.0))
+        assert np.count_nonzero(found.fresh) == pytest.approx(np.count_nonzero(new), rel=0.35)
+
+
+@pytest.mark.parametrize("noise", [0.0, 1e-10, 1e-9, 8e-9, 3e-8])
+@pytest.mark.parametrize("digits", [0.0, 1e-9, 1e-8, 1e-7])
+def test_fresh_readings_are_never_left_out(noise, digits):
+    rng = np.random.default_rng(4)
+    for rate, speed in ((200, 120.0), (1000, 20.0), (10_000, 5.0)):
+        t, v = drive(rng, rate, 20_000 / rate, speed)
+        y = readings(rng, v, noise, digits)
+        assert held_readings(y, v).fresh.all()
+        # A measured voltage, a stage at rest, and one that follows steps.
+        assert held_readings(y, v + rng.normal(0.0, 0.02, v.size)).fresh.all()
+        steps = v[:: rate // 10].repeat(rate // 10)[: v.size]
+        assert held_readings(readings(rng, steps, noise, digits), steps).fresh.all()
+
+
+@pytest.mark.parametrize(
+    ("rows", "digits", "jitter"),
+    [(2, 1e-9, False), pytest.param(10, 0.0, True, marks=pytest.mark.long), (20, 1e-8, False)],
+)
+def test_a_model_is_as_good_as_that_of_the_fresh_readings(rows, digits, jitter):
+    rng = np.random.default_rng(5)
+    t, v = drive(rng, 1000, 12.0)
+    y, new = held(rng, readings(rng, v, 8e-9, digits), rows, jitter)
+    t2, v2 = drive(rng, 1000, 5.0)
+    clean, noise = readings(rng, v2, 0.0, 0.0), rng.normal(0.0, 8e-9, v2.size)
+    errors = []
+    for shown in (y, np.where(new, y, np.nan)):
+        model = slpi_ros.identify(record(t, v, shown))
+        told = slpi_ros.verify([record(t2, v2, clean + noise)], model)
+        (judged,) = told.axes["x"].records
+        errors.append(judged.error.rms)
+    assert errors[0] < 1.1 * errors[1]
+    # And it is judged by fresh readings only, all of them.
+    ((one,), (other,)) = (
+        slpi_ros.verify([record(t, v, shown)], model).axes["x"].records for shown in (y, np.where(new, y, np.nan))
+    )
+    assert one.error.rms == pytest.approx(other.error.rms, rel=0.05) and one.share == pytest.approx(1.0, abs=0.1)
+
+
+def test_it_is_told_and_judged_at_the_rate_of_the_sensor():
+    rng = np.random.default_rng(6)
+    t, v = drive(rng, 1000, 15.0)
+    y, _ = held(rng, readings(rng, v, 8e-9, 0.0), 4, jitter=False)
+    quality = slpi_ros.assess(record(t, v, y), "x")
+    assert quality.displacement.held == pytest.approx(4.0, rel=0.01)
+    assert quality.displacement.noise == pytest.approx(8e-9, rel=0.2)
+    assert not quality.displacement.stuck and not quality.displacement.mixed
+    assert any(one.level == "warn" and holds(one.text, 4, 250) for one in slpi_ros.findings(quality))
+    fresh, rows = without_held(record(t, v, y), "x")
+    assert rows == pytest.approx(4.0, rel=0.01) and np.isnan(fresh.displacement["x"]).mean() == pytest.approx(
+        0.75, abs=0.01
+    )

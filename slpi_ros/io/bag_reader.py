@@ -15,7 +15,7 @@ from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.io.alignment import SeparateTopics, Signals, combine
 from slpi_ros.io.bag_files import absolute_name, locate, match_topic, metadata, require_bounded, translated, unpacked
 from slpi_ros.io.bag_storage import Connection, McapFile, MessageBlock, SqliteFile
-from slpi_ros.io.input_limits import BAG_BYTES, MOST_AXES, open_input, require_count
+from slpi_ros.io.input_limits import BAG_BYTES, MOST_AXES, LimitError, open_input, require_count
 from slpi_ros.io.message_order import in_order
 from slpi_ros.io.messages import (
     JOINT_STATE,
@@ -385,6 +385,8 @@ def _each(block: MessageBlock, msgtype: str, messages: Sequence[Message]) -> _Pa
     for name in names:
         columns |= {(field, name): np.full(len(messages), np.nan) for field in kind_of(msgtype).fields}
     for row, message in enumerate(messages):
+        if len(set(message.names)) < len(message.names):
+            raise LimitError(f"message {row + 1} of a block names an axis twice ({', '.join(message.names)})")
         for field, numbers in message.values.items():
             # zip stops at the shorter sequence: names beyond the end of an array have no value.
             for name, number in zip(message.names, numbers, strict=False):

@@ -224,3 +224,10 @@ def test_sqlite_files_too(tmp_path):
     read = read_bag(tmp_path / "bag")
     np.testing.assert_array_equal(read.time_ns, stamps)
     assert any("set back" in note for note in read.notes)
+
+
+def test_an_axis_that_is_named_twice(tmp_path):
+    both = encode_joint_states(STAMPS, np.column_stack([Y, Y + 1e-6]), np.column_stack([V, V]), ("x", "x"))
+    path = mcap(tmp_path / "bag.mcap", [("a", at, data) for at, data in zip(STAMPS, both, strict=True)])
+    message = refusal(RecordError, read_bag, path)
+    assert holds(message, path, "x, x") and "recover" not in message

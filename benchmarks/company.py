@@ -133,7 +133,7 @@ def _mover(name: str, program: str, **given: object) -> tuple[object, ...]:
 
 def alone(rng: random.Random) -> Plan:
     """One of each, before or after the stage, of any name that is no other one."""
-    frame = rng.choice((MINE, MINE, "", "base_link", "/world"))
+    frame = rng.choice((MINE, MINE, "odom", "base_link", "/world"))
     acts = [_stage(frame), _mover("a", rng.choice(MOVERS))]
     rng.shuffle(acts)
     return Plan("alone", ("a",), (Step((acts[0], ("wait", rng.uniform(0.0, 1.5)), acts[1]), ("a",), seconds=2.0),))
@@ -375,7 +375,8 @@ class Life:
             for each in said:
                 good = each.name in (before if each.at <= border else after) and max(each.voltages) < step.below
                 if each.name in self._plan.judged and not good:
-                    self._wrong(f"{each.name} said {each.voltages} V on {each.topic} in '{step}'")
+                    late = f"{border - each.at:.2f} s too early" if each.at < border else ""
+                    self._wrong(f"in '{step}' {each.name} on {each.topic}", f"{each.voltages} V, {late}")
             allowed = after
         figures.unknown = sum(each.name not in self._programs for each in self._speakers.said)
         return figures
@@ -386,10 +387,11 @@ class Life:
         told = times.get("settle") or times.get("played")
         return told or max(last, default=times.get("end") or times.get("leaves") or 0.0)
 
-    def _wrong(self, told: str) -> None:
+    def _wrong(self, what: str, told: str) -> None:
+        """Count it; tell the first one of its kind."""
         self._figures.wrong += 1
-        if told not in self._figures.told[-1:]:
-            self._figures.told.append(told)
+        if not any(each.startswith(what) for each in self._figures.told):
+            self._figures.told.append(f"{what}: {told}")
 
     def _await(self, step: Step) -> None:
         """Wait until what must speak does, each or one of them."""
@@ -439,7 +441,7 @@ class Life:
         try:
             self._processes[name].wait(PATIENCE)
         except subprocess.TimeoutExpired:
-            self._wrong(f"{name} does not end: {(self._folder / f'{name}.log').read_text()[-1500:]}")
+            self._wrong(f"{name} does not end", (self._folder / f"{name}.log").read_text()[-1500:])
             os.killpg(self._processes[name].pid, signal.SIGKILL)
             self._processes[name].wait()
         time.sleep(0.1)
@@ -495,7 +497,7 @@ class Life:
             if at := [at for phase, at in self._phases if phase == wanted]:
                 return at[0]
             time.sleep(0.02)
-        self._wrong(f"no block is {wanted}: {self._phases}")
+        self._wrong(f"no block is {wanted}", str(self._phases))
         return time.monotonic()
 
     def _desire(self) -> None:

@@ -73,6 +73,10 @@ class DriveMonitor:
         known = [v for v in found if v is not None]
         return known if len(known) == len(found) else None
 
+    def moves(self) -> bool:
+        """Return whether the voltage of an axis moves, by the reports of the last second."""
+        return any(amplifier.moves(self._now_ns) for amplifier in self._amplifiers)
+
     def refusal(self, v: Sequence[float], y: Sequence[float]) -> str:
         """Return which rule a state breaks, voltages `v` (V) and displacements `y` (m), with value and limit; or ""."""
         for axis, voltage, reading in zip(self._axes, v, y, strict=True):

@@ -109,8 +109,12 @@ class GuardedDrive:
         # A drive goes over the whole range: it waits until the middleware has found everybody, on a busy machine too.
         if not (graph_known(now_ns, self._begun_ns, 0) and graph_known(now_ns, self._begun_ns, self._state_ns)):
             return "looking who else is there"
-        company = self.company()
-        return f"{company}; stop it" if company else self._second_reporter()
+        if company := self.company():
+            return f"{company}; stop it"
+        if self.monitor.moves():
+            # The middleware may not have found it yet.
+            return "the voltage of the stage moves: another node commands it; stop it"
+        return self._second_reporter()
 
     def _second_reporter(self) -> str:
         """Return which publishers report the same axis, "" if each is reported by one."""

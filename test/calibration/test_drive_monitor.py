@@ -122,3 +122,13 @@ def test_the_slope_at_the_beginning_of_a_motion_is_the_true_one():
     slope, error, sign = surest_slope(v, -1e-7 * v, FOLLOWING)
     assert slope == pytest.approx(1e-7) and sign == -1.0 and error < 1e-3 * slope
     assert surest_slope(v, np.zeros(v.size), FOLLOWING)[0] == 0.0
+
+
+@pytest.mark.parametrize("slope", [0.0, 20.0, -60.0])
+def test_a_voltage_that_moves_before_the_drive_is_told(slope):
+    monitor = DriveMonitor(("x", "y"), [Limits(0.0, 100.0)] * 2, 0.5)
+    random = np.random.default_rng(3)
+    for k in range(100):
+        v, now_ns = 60.0 + slope * 0.01 * k, k * SECOND_NS // 100
+        monitor.state(now_ns, now_ns, [50.0 + 0.3 * random.normal(), v + 0.3 * random.normal()], [0.0, 0.0], now_ns)
+    assert monitor.moves() == bool(slope)

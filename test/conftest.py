@@ -12,7 +12,7 @@ from typing import Any
 import hypothesis
 import pytest
 
-from benchmarks.ros_domain import keep_to_own_domain
+from benchmarks.ros_domain import OWN, keep_to_own_domain
 
 CHECKOUT = Path(__file__).resolve().parents[1]
 # The folder whose tests start nodes.
@@ -43,6 +43,7 @@ for _threads in ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS"):
     os.environ.setdefault(_threads, "1")
 
 # Set before any test module imports rclpy; the nodes that tests start inherit both.
+os.environ.pop(OWN, None)  # that of pytest's first process
 keep_to_own_domain()
 
 # A shell starts background jobs with SIGINT ignored, and the nodes that tests start and interrupt inherit that.

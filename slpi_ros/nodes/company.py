@@ -79,8 +79,8 @@ class Company:
         return self._commands is not None
 
     def _on_command(self, data: bytes) -> None:
-        """Take a voltage, which may be one of this node."""
-        if data not in self.own:
+        """Take a voltage, which may be one of this node; one that came before the end of listening counts no more."""
+        if self.listens and data not in self.own:
             self._listening.hear(time.monotonic_ns())
 
     def heard(self, now_ns: int) -> None:

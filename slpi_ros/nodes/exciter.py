@@ -179,7 +179,7 @@ class Exciter(Node):
     def _lacking(self) -> str:
         """Return what is missing before the drive may start, and what to do; "" if nothing is."""
         lacking = self._guard.lacking()
-        if self._guard.stranger():
+        if self._guard.stranger() or not self._guard.looks:
             return lacking
         if lacking and self._guard.publisher.get_subscription_count() and not self._guard.heard:
             if self._values["rest_voltage"]:

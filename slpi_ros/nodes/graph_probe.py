@@ -71,7 +71,8 @@ class _Probe:
             [name for name in (full_name(space, name) for name, space in names) if name != own],
             _ends(node.get_publishers_info_by_topic(self._state)),
             list(commanding),
-            list(_ends(node.get_subscriptions_info_by_topic(self._command))),
+            # A compensator hears the voltages of others until its first one.
+            [each for each in _ends(node.get_subscriptions_info_by_topic(self._command)) if each not in commanding],
             stamps,
             arrivals,
             list(last.name),

@@ -103,15 +103,18 @@ class GuardedDrive:
         """Return the error if another node has published the topic of the voltages for longer than a killed one."""
         return self.not_alone() if time.monotonic_ns() - self._since_ns > LEFT_NS else None
 
-    def stranger(self) -> str:
-        """Return who else commands or reports the stage, or that it is not known yet; "" if nobody does."""
+    @property
+    def looks(self) -> bool:
+        """Whether the middleware has had the time to find everybody."""
         now_ns = time.monotonic_ns()
-        # A drive goes over the whole range: it waits until the middleware has found everybody, on a busy machine too.
-        if not (graph_known(now_ns, self._begun_ns, 0) and graph_known(now_ns, self._begun_ns, self._state_ns)):
-            return "looking who else is there"
+        # A drive goes over the whole range: it waits for that on a busy machine too.
+        return graph_known(now_ns, self._begun_ns, 0) and graph_known(now_ns, self._begun_ns, self._state_ns)
+
+    def stranger(self) -> str:
+        """Return who else commands or reports the stage, "" if nobody does as far as is known."""
         if company := self.company():
             return f"{company}; stop it"
-        if self.monitor.moves():
+        if self.looks and self.monitor.moves():
             # The middleware may not have found it yet.
             return "the voltage of the stage moves: another node commands it; stop it"
         return self._second_reporter()
@@ -134,7 +137,7 @@ class GuardedDrive:
             return f"no valid {topic}: {self.monitor.refused}"
         if self.found() is None:
             return f"no report of the voltage of the axes {', '.join(self._axes)} on {topic}; check the driver"
-        return ""
+        return "" if self.looks else "looking who else is there"
 
     def found(self) -> list[float] | None:
         """Return the voltages (V) at which the amplifier is, as reported; None if they are not known yet."""

@@ -88,7 +88,7 @@ def test_compensator_driver_and_simulated_device_in_one_launch(tmp_path, way):
     place = {"device": "gcs", "address": address}
     given = {
         "device_simulator": {**place, "voltage": 10.0, "noise_rms": 0.0},
-        "driver": {**place, **LIMITS, "rate": 100.0, "rearm": True},
+        "driver": {**place, **LIMITS, "rate": 100.0, "rearm": True, "hardware_id": stage_model().hardware_id},
         "compensator": {"axes": ["x"], **LIMITS},
     }
     file.write_text(yaml.safe_dump({f"/**/{name}": {"ros__parameters": each} for name, each in given.items()}))

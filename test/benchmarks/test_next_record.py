@@ -149,6 +149,7 @@ def test_an_ambiguous_record_and_the_advised_one(next_record, monkeypatch):
     assert answers.asked[1][0] == answers.asked[0][0] != answers.asked[1][1]
 
 
+@pytest.mark.slow
 def test_a_pair_is_judged_on_a_third_record(next_record, monkeypatch):
     answers = Answers()
     monkeypatch.setattr(slpi_ros, "diagnose", answers)

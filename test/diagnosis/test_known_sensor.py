@@ -67,6 +67,7 @@ def path():
     return t, 1e-6 * (9.0 - 6.0 * np.cos(2 * np.pi * 2.0 * t))
 
 
+@pytest.mark.slow
 def test_a_late_sensor_sends_the_stage_nowhere_else(first, prompt, known):
     """Along the path and sample by sample as if it had not been late; unknown, it counts as loops of the stage."""
     assert known.axes["x"].sensor == Sensor(LATE["sensor_delay"], LATE["sensor_lag"]) and not known.axes["x"].effects

@@ -38,6 +38,7 @@ class Page(HTMLParser):
             self.resources.append(given[SHOWN[tag]])
 
 
+@pytest.mark.slow
 def test_the_site_builds_without_a_warning_and_its_links_lead_somewhere(tmp_path):
     command = [sys.executable, "-m", "sphinx", "-E", "-W", "--keep-going", "-q", "-d", tmp_path / "state", DOCS]
     built = tmp_path / "html"

@@ -113,6 +113,7 @@ def test_given_models_a_date_and_a_list(done, stages, client, tmp_path):
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_the_cause_of_an_error_that_is_no_change_is_named(stages, client, tmp_path):
     stages.write(tmp_path / "bags", "a", 0)
     record = stages.record("a", 5)

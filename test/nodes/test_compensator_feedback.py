@@ -59,6 +59,7 @@ class DriftedStage:
 PATH = (5e-6 + 2e-6 * np.sin(np.linspace(0.0, 6.0, 400))).tolist()
 
 
+@pytest.mark.slow
 def test_feedback_corrects_what_the_model_does_not_know_and_the_drift_is_told(x_file):
     with compensator(model_file=x_file, measurement_timeout=10, feedback_fault_time=0, **GAINS) as client:
         client.connect()
@@ -87,6 +88,7 @@ def test_feedback_corrects_what_the_model_does_not_know_and_the_drift_is_told(x_
         client.report(**{"x.feedback": "off"})
 
 
+@pytest.mark.slow
 def test_the_tracking_error_is_published_for_each_axis(x_file):
     with compensator(model_file=x_file) as client:
         client.connect()

@@ -136,6 +136,7 @@ def test_on_timeout_changed_in_the_silence_counts_at_once(x_file):
         wait_for_message(client, "compensating")
 
 
+@pytest.mark.slow
 def test_another_publisher_of_the_voltages_is_named(x_file):
     with compensator(model_file=x_file) as client:
         client.connect()

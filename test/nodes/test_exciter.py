@@ -227,6 +227,7 @@ def test_a_signal_brings_the_stage_back(number):
     assert len(v) < 20.0 * RATE
 
 
+@pytest.mark.slow
 def test_it_ends_after_a_slow_stage_has_reported_the_last_voltage():
     """Who stops the recorder when the exciter has ended has the memory at the end on record."""
     behind, reported = 1.5, []
@@ -321,6 +322,7 @@ def test_it_drives_nothing_before_the_middleware_has_had_the_time_to_find_everyb
             assert time.monotonic_ns() - begun >= LOOK_WITHOUT_NS
 
 
+@pytest.mark.slow
 def test_it_drives_nothing_beside_another_publisher():
     with on_graph() as graph:
         graph.node.create_publisher(Float64MultiArray, "voltage_command", RELIABLE)

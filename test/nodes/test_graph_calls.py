@@ -32,6 +32,7 @@ def x_file(tmp_path_factory):
     return str(path)
 
 
+@pytest.mark.slow
 def test_a_service_is_called_and_first_it_is_said_what_that_moves(x_file):
     given = {"model_file": x_file, "reset_cycles": 2, "slew_limit": 2000.0, "reset_rate": 1000.0}
     with compensator("-r", "__ns:=/lab", namespace="/lab", **given) as client:
@@ -50,6 +51,7 @@ def test_a_service_is_called_and_first_it_is_said_what_that_moves(x_file):
         assert wrong.returncode == 2 and holds(wrong.stderr, "/lab/compensator/fly", "reset_memory")
 
 
+@pytest.mark.slow
 def test_a_parameter_is_told_and_set_as_what_it_is(tmp_path):
     with started("stage_simulator", {"axes": ["x", "y"]}), started("identify", {"kind": "pi"}) as node:
         told = slpi("param", "/identify", "kind")

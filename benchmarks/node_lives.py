@@ -41,7 +41,6 @@ LOW, HIGH = 2.0, 98.0
 START_NS, MS = 1_700_000_000_000_000_000, 1_000_000
 NAN, INF = float("nan"), inf
 # What a second publisher of voltage_command says: no voltage of the node, so that the two can be told apart.
-FOREIGN = [-777.0, -777.0]
 # Messages sent at once and not yet answered: fewer than the node's queue holds.
 BURST = 8
 BAD = [
@@ -264,22 +263,21 @@ class Life:
     @property
     def answers(self) -> list[list[float]]:
         """Voltages of the node so far, volts, that differ from the one before: it repeats its last one."""
-        return [answer for answer, _ in groupby(each for each in self.client.answers if each != FOREIGN)]
+        return [answer for answer, _ in groupby(self.client.answers)]
 
     def _move(self) -> None:
         from nodes.ros_helpers import LATCHED, RELIABLE
         from sensor_msgs.msg import JointState
-        from std_msgs.msg import Float64MultiArray, String
+        from std_msgs.msg import String
 
         graph = self.client.graph
         self._models = graph.publisher(String, f"{self.namespace}/stage_model", LATCHED)
-        self._foreign = graph.node.create_publisher(Float64MultiArray, f"{self.namespace}/voltage_command", RELIABLE)
         self._second = graph.publisher(JointState, f"{self.namespace}/desired_displacement", RELIABLE)
         self._measured = graph.node.create_publisher(JointState, f"{self.namespace}/measured_displacement", RELIABLE)
         self._refused = self._swaps = 0
         faults = (
             self._bad_message, self._late_message, self._clock_jump, self._hostile_model, self._new_model,
-            self._second_sender, self._foreign_voltages, self._pause, self._disk_fault, self._bad_measurement,
+            self._second_sender, self._pause, self._disk_fault, self._bad_measurement,
         )  # fmt: skip
         for _ in range(self.rng.randint(20, 60)):
             if self.rng.random() < 0.6:
@@ -375,13 +373,6 @@ class Life:
         refused = found.controller.counts["rejected"] - self.twin.controller.counts["rejected"]
         self.twin = found
         self.note("second publishers of desired_displacement", refused)
-
-    def _foreign_voltages(self) -> None:
-        from std_msgs.msg import Float64MultiArray
-
-        for _ in range(3):
-            self._foreign.publish(Float64MultiArray(data=FOREIGN))
-        self.note("second publishers of voltage_command")
 
     def _pause(self) -> None:
         """Stop the process for a while, as a busy machine does."""

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.hysteresis.branches import AT_REST, LONG_FALL, trace
-from slpi_ros.hysteresis.turning_points import worth_compiling
+from slpi_ros.hysteresis.turning_points import always_compiled
 
 
 @dataclass(frozen=True)
@@ -160,7 +160,7 @@ class Design:
 
     def normal_equations(self, y: FloatArray, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Return ``A' W A``, shape (p, p), and ``A' W y``, shape (p,), for `y` and `weights` of shape (N,)."""
-        if worth_compiling(y.size):
+        if always_compiled(y.size):
             from slpi_ros.identification.compiled_design import accumulate
 
             local, walk, size = self.local, self.walk, self.local.shape[1]

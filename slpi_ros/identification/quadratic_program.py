@@ -121,6 +121,9 @@ def cholesky(matrix: FloatArray, *, overwrite: bool = False) -> FloatArray:
 
 def solve_triangular(root: FloatArray, right: FloatArray, trans: str = "N") -> FloatArray:
     """Return ``root^-1 right``, or with `trans` "T" ``root^-T right``, for a lower `root`, shape (p, p)."""
+    # SciPy 1.11 takes nothing empty.
+    if not right.size:
+        return np.zeros(right.shape)
     solution: FloatArray = scipy.linalg.solve_triangular(root, right, trans, lower=True, check_finite=False)
     return solution
 
@@ -136,8 +139,10 @@ def nonnegative_change(gram: FloatArray, gap: FloatArray, present: FloatArray) -
     fewest, left = gap.size + 1, 3
     while left:
         at, change = np.flatnonzero(free), np.where(free, 0.0, -present)
-        root = cholesky(gram[np.ix_(at, at)])
-        change[at] = scipy.linalg.cho_solve((root, True), (gap - gram @ change)[at], check_finite=False)
+        # SciPy 1.11 takes nothing empty.
+        if at.size:
+            root = cholesky(gram[np.ix_(at, at)])
+            change[at] = scipy.linalg.cho_solve((root, True), (gap - gram @ change)[at], check_finite=False)
         # What is smaller than the rounding of the sum is no sign.
         rounding = 1e-15 * np.max(np.abs(gram) @ np.abs(change) + np.abs(gap), initial=0.0)
         wrong = np.where(free, present + change < 0.0, gram @ change - gap < -rounding)

@@ -19,6 +19,8 @@ from slpi_ros.io.tables import import_table, import_with_summary, read_table
 def no_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
+        # Under Python 3.12, of dateutil and openpyxl.
+        warnings.filterwarnings("ignore", r"datetime\.datetime\.utc", DeprecationWarning)
         yield
 
 

@@ -371,7 +371,7 @@ class Life:
             if step.one_of:
                 counts = Counter(each.name for each in said if each.topic == COMMAND and each.name in step.must)
                 before = after = {name for name, _ in counts.most_common(1)}
-            border = self._border(times, [each.at for each in said if each.name in ended - after])
+            border = self._border(times, [each.at for each in self._speakers.said if each.name in ended - after])
             for each in said:
                 good = each.name in (before if each.at <= border else after) and max(each.voltages) < step.below
                 if each.name in self._plan.judged and not good:
@@ -383,7 +383,7 @@ class Life:
 
     @staticmethod
     def _border(times: Mapping[str, float | None], last: Sequence[float]) -> float:
-        """Return the time until which the step before holds: `last`, what ended said, is among it."""
+        """Return the time until which the step before holds: that of the `last` word of what ended, if it said any."""
         told = times.get("settle") or times.get("played")
         return told or max(last, default=times.get("end") or times.get("leaves") or 0.0)
 

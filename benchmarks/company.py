@@ -229,7 +229,7 @@ def foreign(rng: random.Random) -> Plan:
 
 def exchanged(rng: random.Random) -> Plan:
     """A stage that becomes another one is driven no more."""
-    exchange = (("end", "stage", rng.choice(SIGNALS)), _stage(THEIRS, "other"), ("heard", "other"), ("settle", 1.0))
+    exchange = (("end", "stage", rng.choice(SIGNALS)), _stage(THEIRS, "other"), ("heard", "other"), ("settle", 4.0))
     return Plan(
         "stage exchanged", ("a",),
         (
@@ -342,7 +342,7 @@ class Life:
         self._phases: list[tuple[str, float]] = []  # of blocks, and when they were told
         speakers.node.create_subscription(
             DiagnosticStatus, "voltage_trajectory_state",
-            lambda status: self._phases.append((status.message, time.monotonic())), 10,
+            lambda status: self._phases.append((status.message, time.time())), 10,
         )  # fmt: skip
         speakers.node.create_timer(0.05, self._desire)
         speakers.begin()
@@ -371,7 +371,7 @@ class Life:
             if step.one_of:
                 counts = Counter(each.name for each in said if each.topic == COMMAND and each.name in step.must)
                 before = after = {name for name, _ in counts.most_common(1)}
-            border = self._border(times, [each.at for each in said if each.name in ended - after])
+            border = self._border(times, [each.at for each in self._speakers.said if each.name in ended - after])
             for each in said:
                 good = each.name in (before if each.at <= border else after) and max(each.voltages) < step.below
                 if each.name in self._plan.judged and not good:
@@ -383,7 +383,7 @@ class Life:
 
     @staticmethod
     def _border(times: Mapping[str, float | None], last: Sequence[float]) -> float:
-        """Return the time until which the step before holds: `last`, what ended said, is among it."""
+        """Return the time until which the step before holds: that of the `last` word of what ended, if it said any."""
         told = times.get("settle") or times.get("played")
         return told or max(last, default=times.get("end") or times.get("leaves") or 0.0)
 
@@ -395,20 +395,20 @@ class Life:
 
     def _await(self, step: Step) -> None:
         """Wait until what must speak does, each or one of them."""
-        begun, first = time.monotonic(), len(self._speakers.said)
+        begun, first = time.time(), len(self._speakers.said)
         waiting = set(step.must)
-        while waiting and time.monotonic() < begun + PATIENCE:
+        while waiting and time.time() < begun + PATIENCE:
             time.sleep(0.02)
             spoken = {each.name for each in self._speakers.said[first:]} & waiting
             waiting = set() if spoken and step.one_of else waiting - spoken
         self._figures.moved += len(step.must) - len(waiting) if not step.one_of else not waiting
-        self._figures.slowest = max(self._figures.slowest, time.monotonic() - begun if step.must else 0.0)
+        self._figures.slowest = max(self._figures.slowest, time.time() - begun if step.must else 0.0)
         for name in waiting:
             self._figures.refused += 1
             log = (self._folder / f"{name}.log").read_text()[-1500:]
             self._figures.told.append(f"{name} is silent in '{step}': {self._processes[name].poll()}, {log}")
 
-    # Acts; each may return a time (monotonic, s) until when the step before holds.
+    # Acts; each may return a time (s) until when the step before holds.
 
     def _start(self, name: str, program: str, given: dict[str, object], nohup: bool = False) -> None:
         words = [word for key, value in given.items() for word in ("-p", f"{key}:={self._text(value)}")]
@@ -432,7 +432,7 @@ class Life:
         with suppress(ProcessLookupError):
             os.killpg(process.pid, number)
         self._leaves(name)
-        ended = time.monotonic()
+        ended = time.time()
         if number != signal.SIGKILL:
             self._require_rest(name)
         return ended
@@ -445,7 +445,7 @@ class Life:
             os.killpg(self._processes[name].pid, signal.SIGKILL)
             self._processes[name].wait()
         time.sleep(0.1)
-        return time.monotonic()
+        return time.time()
 
     def _require_rest(self, name: str) -> None:
         """Count it if exciter or calibrator leave the stage elsewhere than at rest."""
@@ -461,7 +461,7 @@ class Life:
 
     def _settle(self, seconds: float) -> float:
         time.sleep(seconds)
-        return time.monotonic()
+        return time.time()
 
     def _heard(self, name: str) -> None:
         self._await(Step((), (name,)))
@@ -492,13 +492,13 @@ class Life:
         return self._phase("ended") - 0.2
 
     def _phase(self, wanted: str) -> float:
-        begun = time.monotonic()
-        while time.monotonic() < begun + PATIENCE:
+        begun = time.time()
+        while time.time() < begun + PATIENCE:
             if at := [at for phase, at in self._phases if phase == wanted]:
                 return at[0]
             time.sleep(0.02)
         self._wrong(f"no block is {wanted}", str(self._phases))
-        return time.monotonic()
+        return time.time()
 
     def _desire(self) -> None:
         from sensor_msgs.msg import JointState

@@ -61,7 +61,7 @@ class _Allocator(ctypes.Structure):
 
 @dataclass(frozen=True)
 class Said:
-    """One message: when it came (monotonic, s), who published it on which topic, and its voltages (V)."""
+    """One message: when it was sent (s, by the clock of the system), by whom on which topic, and its voltages (V)."""
 
     at: float
     name: str
@@ -120,18 +120,18 @@ class Speakers:
                 while (taken := self._next(reader)) is not None:
                     self._keep(topic, *taken)
 
-    def _next(self, reader: Any) -> tuple[bytes, bytes] | None:
-        """Return the next message, and the identifier of its publisher."""
+    def _next(self, reader: Any) -> tuple[float, bytes, bytes] | None:
+        """Return when the next message was sent (s), the message, and the identifier of its publisher."""
         info = _Info()
         if self._take(reader.pointer, self._data, info, None):
             return None
-        return ctypes.string_at(self._data.buffer, self._data.length), bytes(info.gid)
+        return info.source_timestamp * 1e-9, ctypes.string_at(self._data.buffer, self._data.length), bytes(info.gid)
 
-    def _keep(self, topic: str, data: bytes, gid: bytes) -> None:
+    def _keep(self, topic: str, sent: float, data: bytes, gid: bytes) -> None:
         kind = topic.rpartition("/")[2]
         message: Any = deserialize_message(data, TOPICS[kind])
         voltages = message.data if kind == "voltage_command" else message.effort
-        self.said.append(Said(time.monotonic(), self._name(topic, gid), kind, tuple(voltages)))
+        self.said.append(Said(sent, self._name(topic, gid), kind, tuple(voltages)))
 
     def _name(self, topic: str, gid: bytes) -> str:
         """Return the name of a node; its publisher may be known before it."""

@@ -135,3 +135,22 @@ def test_several_bags_of_one_stage(tmp_path, record):
     other = str(tmp_path / "other")
     write_bag(other, replace(record, hardware_id="another"))
     assert holds(refusal(RecordError, Source([*bags, other]).read), other, "'another'", bags[0], "'stage'")
+
+
+@pytest.mark.parametrize(
+    ("model", "first", "second"), [("a", "a", "b"), ("a", "b", "b"), ("b", "a", "a"), ("", "a", "b")]
+)
+def test_a_stage_that_is_accepted_is_taken_for_the_other_one(record, tmp_path, model, first, second):
+    names = {"one": first, "two": second}
+    for place, name in names.items():
+        write_bag(tmp_path / place, replace(record, hardware_id=name))
+    bags = [str(tmp_path / place) for place in names]
+    this = model or "a"
+    read = Source(bags, accept_stage="b").read(stage=model)
+    assert [each.hardware_id for each in read] == [this, this]
+    other = Source(bags, accept_stage="c")
+    if first != second:
+        with pytest.raises(RecordError):
+            other.read(stage=model)
+    else:
+        assert [each.hardware_id for each in other.read(stage=model)] == [first, second]

@@ -185,9 +185,11 @@ def source_of(options: Namespace) -> "Source":
     from slpi_ros.workflows.records import Source
 
     start, stop = getattr(options, "start", None), getattr(options, "stop", None)
+    from slpi_ros.io.stage_name import acceptance
+
     accepted = getattr(options, "accept_stage", None) or ""
     if accepted:
-        options.remarks.append(f"what is named stage '{accepted}' is taken for this one (--accept-stage)")
+        options.remarks.append(acceptance(accepted, "--accept-stage"))
     quantities = getattr(options, "quantities", None)
     return Source(options.bags, topic, options.axis, start, stop, surroundings=quantities, accept_stage=accepted)
 

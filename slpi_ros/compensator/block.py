@@ -11,10 +11,11 @@ from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.compensator import validation as rejection
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.monitor import Finding, Rule, Silence
-from slpi_ros.compensator.trajectory import Trajectory, require_mean_rate
+from slpi_ros.compensator.trajectory import Trajectory
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import Limits, RateLimiter
+from slpi_ros.model.mean_rate import WINDOW, highest_mean_rate, slower_by
 from slpi_ros.model.streaming import StageStream
 
 # Most samples of a block: their voltages take some seconds to compute.
@@ -98,7 +99,7 @@ def plan(path: Trajectory, axes: Sequence[Axis], stage: StageStream | None, peri
             behind = step(listed[-1])
     voltages = np.array(rows)
     for axis, v in zip(moved, voltages.T, strict=True):
-        require_mean_rate(axis.name, np.arange(v.size) * period, v, axis.output.limits.mean_rate)
+        _require_mean_rate(axis.name, np.arange(v.size) * period, v, axis.output.limits.mean_rate)
     return Block(stamp_ns, names, period, voltages, lead_in, missed)
 
 
@@ -109,7 +110,17 @@ def require_mean_rates(path: Trajectory, axes: Sequence[Axis]) -> None:
         if axis.name in path.names and axis.model and axis.output.limits.mean_rate < inf:
             within = Limits(axis.stream.limits.lower, axis.stream.limits.upper)
             v, _ = axis.model.compensate(t, path.positions[:, path.names.index(axis.name)], within)
-            require_mean_rate(axis.name, t, v, axis.output.limits.mean_rate)
+            _require_mean_rate(axis.name, t, v, axis.output.limits.mean_rate)
+
+
+def _require_mean_rate(axis: str, t: FloatArray, v: FloatArray, limit: float) -> None:
+    """Reject voltages (V, (N,)) at times (s, (N,)) whose mean rate exceeds a limit (V/s)."""
+    if limit < inf and (slower := slower_by(t, v, limit)) > 1.0:
+        raise RejectedError(
+            rejection.OUT_OF_RANGE,
+            f"axis '{axis}': a mean rate of {highest_mean_rate(t, v):.4g} V/s over {WINDOW:g} s, mean_rate_limit is "
+            f"{limit:g} V/s; send it {slower:.3g} times more slowly",
+        )
 
 
 @contextmanager

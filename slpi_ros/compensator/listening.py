@@ -6,7 +6,8 @@ from collections.abc import Callable, Sequence
 from slpi_ros.compensator.monitor import Finding, Rule
 from slpi_ros.io.messages import SECOND_NS
 
-# The graph is looked at this time after the first stage_state, or after the begin where there is none.
+# The graph is looked at this time after the first stage_state, or after the begin where there is none: the middleware
+# repeats what a busy machine has missed of its discovery after 3 s.
 LOOK_NS, LOOK_WITHOUT_NS = SECOND_NS // 2, 7 * SECOND_NS // 2
 # A voltage counts for this time. Whoever has commanded a stage repeats its voltage within REPEAT_NS.
 QUIET_NS, REPEAT_NS = 3 * SECOND_NS // 2, 4 * SECOND_NS // 5
@@ -14,9 +15,14 @@ QUIET_NS, REPEAT_NS = 3 * SECOND_NS // 2, 4 * SECOND_NS // 5
 RANDOM_NS = SECOND_NS // 2
 
 
+def all_found(now_ns: int, begun_ns: int) -> bool:
+    """Return whether the middleware has had the time to find everybody since `begun_ns`, on a busy machine too."""
+    return now_ns - begun_ns >= LOOK_WITHOUT_NS
+
+
 def graph_known(now_ns: int, begun_ns: int, state_ns: int) -> bool:
     """Return whether a node that began at `begun_ns`, and first heard the stage at `state_ns` (0: never), may look."""
-    return now_ns - state_ns >= LOOK_NS if state_ns else now_ns - begun_ns >= LOOK_WITHOUT_NS
+    return now_ns - state_ns >= LOOK_NS if state_ns else all_found(now_ns, begun_ns)
 
 
 class Listening(Rule):
@@ -75,7 +81,7 @@ class Listening(Rule):
 
     def found_all(self, now_ns: int) -> bool:
         """Return whether the middleware has had the time to find everybody."""
-        return now_ns - self._begun_ns >= LOOK_WITHOUT_NS
+        return all_found(now_ns, self._begun_ns)
 
     def looks(self, now_ns: int) -> bool:
         """Return whether the others have had the time to be known."""

@@ -3,7 +3,6 @@
 from bisect import bisect_left
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import inf
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,10 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.compensator import validation as rejection
-from slpi_ros.compensator.validation import OUT_OF_RANGE, RejectedError, require_names
+from slpi_ros.compensator.validation import RejectedError, require_names
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import PERIOD, Limits, RateLimiter
-from slpi_ros.model.mean_rate import WINDOW, highest_mean_rate, slower_by
 from slpi_ros.model.streaming import StreamingInverse, refusal
 
 # Upper limit of valid times; the sum of two times does not overflow int64.
@@ -272,16 +270,6 @@ class TrajectoryExecutor:
         if track.next == track.stop:
             self._tracks.remove(track)
         return point
-
-
-def require_mean_rate(axis: str, t: FloatArray, v: FloatArray, limit: float) -> None:
-    """Reject voltages (V, (N,)) at times (s, (N,)) whose mean rate exceeds a limit (V/s)."""
-    if limit < inf and (slower := slower_by(t, v, limit)) > 1.0:
-        raise RejectedError(
-            OUT_OF_RANGE,
-            f"axis '{axis}': a mean rate of {highest_mean_rate(t, v):.4g} V/s over {WINDOW:g} s, mean_rate_limit is "
-            f"{limit:g} V/s; send it {slower:.3g} times more slowly",
-        )
 
 
 def _look_ahead(

@@ -34,6 +34,11 @@ def same_stage(one: str, other: str, accepted: str = "") -> bool:
     return len(names) == 1 or bool(names & {"", stage_name(accepted)})
 
 
+def acceptance(name: str, option: str) -> str:
+    """Return what is said of a name that is taken for that of this stage, by a parameter or an option."""
+    return f"what is named stage '{name}' is taken for this one ({option})"
+
+
 def device_name(identity: str) -> str:
     """Return what tells a device from others of its kind, by all that it says of itself; "" if nothing does."""
     return _of_device(identity.strip())

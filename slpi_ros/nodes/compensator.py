@@ -16,10 +16,12 @@ from trajectory_msgs.msg import JointTrajectory
 
 from slpi_ros.compensator.amplifier import REARM_NS, Calibration
 from slpi_ros.compensator.controller import Controller, OperatingMode, StopReason
+from slpi_ros.compensator.listening import all_found
 from slpi_ros.compensator.ownership import AUTO
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS, JointStates
+from slpi_ros.io.stage_name import acceptance
 from slpi_ros.model.limits import volts
 from slpi_ros.nodes.common import (
     COMMANDS,
@@ -53,9 +55,8 @@ OLDEST_NS, EARLIEST_NS = SECOND_NS // 5, SECOND_NS // 20
 REPORT_NS = SECOND_NS // 200
 # Time between two looks for topics of quantities and their age.
 LOOK_NS = SECOND_NS // 2
-# Time from the start of the node within which publishers of stage_state are discovered; polling period, seconds.
-# The middleware repeats what a busy machine has missed of its discovery after 3 s.
-DISCOVERY_NS, DISCOVERY_POLL = 7 * SECOND_NS // 2, 0.005
+# Polling period while publishers of stage_state are discovered, seconds.
+DISCOVERY_POLL = 0.005
 # Desired messages that are answered at once if they wait.
 BACKLOG = 200
 
@@ -105,7 +106,7 @@ class Compensator(LifecycleNode):
         steady_timer(self, values["diagnostic_period"], self._on_period)
         steady_timer(self, WATCH_PERIOD, self._watch)
         if accepted := values["accept_stage"]:
-            self.get_logger().warning(f"what is named stage '{accepted}' is taken for this one (accept_stage)")
+            self.get_logger().warning(acceptance(accepted, "accept_stage"))
         if values["realtime_priority"]:
             ask_for_priority(self, values["realtime_priority"])
         if values["autostart"]:
@@ -154,7 +155,7 @@ class Compensator(LifecycleNode):
         self._company.listen()
         if AUTO in self._settings.starts:
             # Until this node may know whether stage_state has a publisher: commands are not taken before that.
-            while not self._is_reported and time.monotonic_ns() - self._begun_ns < DISCOVERY_NS and self.context.ok():
+            while not (self._is_reported or all_found(time.monotonic_ns(), self._begun_ns)) and self.context.ok():
                 time.sleep(DISCOVERY_POLL)
         self._paths.output = self._output = Output(self, self._controller, self._memory, self._reporter, self._company)
         on_desired: dict[str, tuple[Any, Any]] = {

@@ -81,10 +81,11 @@ class ExciterSettings:
         """Raise UsageError if the mean rate of an axis exceeds its limit."""
         again = 1 + math.ceil(WINDOW / drive.t[-1]) if self.values["repeat"] else 1
         t = np.concatenate([drive.t + number * drive.t[-1] for number in range(again)])
-        for (axis, v), limits in zip(drive.voltage.items(), self.limits, strict=True):
-            if (slower := slower_by(t, np.tile(v, again), limits.mean_rate)) > 1.0:
+        for (axis, once), limits in zip(drive.voltage.items(), self.limits, strict=True):
+            v = np.tile(once, again)
+            if (slower := slower_by(t, v, limits.mean_rate)) > 1.0:
                 raise UsageError(
-                    f"axis '{axis}': the drive has a mean rate of {highest_mean_rate(t, np.tile(v, again)):.4g} V/s "
+                    f"axis '{axis}': the drive has a mean rate of {highest_mean_rate(t, v):.4g} V/s "
                     f"over {WINDOW:g} s, mean_rate_limit is {limits.mean_rate:g} V/s; make it {slower:.3g} times "
                     f"slower: slew_limit {limits.slew / slower:.4g} and duration {self.values['duration'] * slower:.4g}"
                 )
@@ -179,13 +180,13 @@ class Exciter(Node):
     def _lacking(self) -> str:
         """Return what is missing before the drive may start, and what to do; "" if nothing is."""
         lacking = self._guard.lacking()
+        if not lacking or self._guard.heard or not self._guard.publisher.get_subscription_count():
+            return lacking
         if self._guard.stranger() or not self._guard.looks:
             return lacking
-        if lacking and self._guard.publisher.get_subscription_count() and not self._guard.heard:
-            if self._values["rest_voltage"]:
-                return ""
-            return f"{lacking}; or give rest_voltage, if nothing reports where the amplifier is"
-        return lacking
+        if self._values["rest_voltage"]:
+            return ""
+        return f"{lacking}; or give rest_voltage, if nothing reports where the amplifier is"
 
     # Excitation
 

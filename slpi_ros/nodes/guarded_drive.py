@@ -15,7 +15,7 @@ from std_msgs.msg import Float64MultiArray
 
 from slpi_ros.calibration.drive_monitor import DriveMonitor
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
-from slpi_ros.compensator.listening import graph_known
+from slpi_ros.compensator.listening import all_found, graph_known
 from slpi_ros.compensator.monitor import Monitor
 from slpi_ros.compensator.reporters import SoleReporter
 from slpi_ros.errors import RecordError
@@ -108,7 +108,7 @@ class GuardedDrive:
         """Whether the middleware has had the time to find everybody."""
         now_ns = time.monotonic_ns()
         # A drive goes over the whole range: it waits for that on a busy machine too.
-        return graph_known(now_ns, self._begun_ns, 0) and graph_known(now_ns, self._begun_ns, self._state_ns)
+        return all_found(now_ns, self._begun_ns) and graph_known(now_ns, self._begun_ns, self._state_ns)
 
     def stranger(self) -> str:
         """Return who else commands or reports the stage, "" if nobody does as far as is known."""

@@ -9,13 +9,14 @@ from rclpy.qos import QoSProfile, ReliabilityPolicy
 from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
+from slpi_ros.compensator.listening import LOOK_WITHOUT_NS, QUIET_NS
 from slpi_ros.errors import RecordError, shown
 from slpi_ros.io.stage_name import same_stage, stage_name
 from slpi_ros.nodes.common import publishers_beside
 
 # Time to find publishers, as middleware announces itself every 3 s where what it said at first is lost, and to hear one
 # that was found: one that was killed is known for 20 s more, and silent.
-FIND, HEAR = 3.5, 1.5
+FIND, HEAR = LOOK_WITHOUT_NS * 1e-9, QUIET_NS * 1e-9
 # In names that the graph does not know yet.
 UNKNOWN = "_UNKNOWN_"
 

@@ -51,12 +51,11 @@ class Source:
             return tuple(_with_chosen(record, self.surroundings) for record in self.records)
         records = tuple(self._ordered(self._read(str(bag), coupled)) for bag in require_different(self.bags))
         if self.accept_stage:
-            names = (stage, *(record.hardware_id for record in records))
-            this = next((name for name in names if name and not same_stage(name, self.accept_stage)), self.accept_stage)
+            names = (record.hardware_id for record in records)
+            others = (name for name in names if name and not same_stage(name, self.accept_stage))
+            this = stage or next(others, self.accept_stage)
             records = tuple(
-                replace(record, hardware_id=stage or this)
-                if same_stage(record.hardware_id, stage or this, self.accept_stage)
-                else record
+                replace(record, hardware_id=this) if same_stage(record.hardware_id, this, self.accept_stage) else record
                 for record in records
             )
         require_one_stage(records)

@@ -6,8 +6,8 @@ from collections.abc import Callable, Sequence
 from slpi_ros.compensator.monitor import Finding, Rule
 from slpi_ros.io.messages import SECOND_NS
 
-# The graph is looked at this time after the first stage_state, or after the begin where there is none: the middleware
-# repeats what a busy machine has missed of its discovery after 3 s.
+# The graph is looked at this time after the first stage_state where this node has left the stage as it is, otherwise
+# after the begin: the middleware repeats what a busy machine has missed of its discovery after 3 s.
 LOOK_NS, LOOK_WITHOUT_NS = SECOND_NS // 2, 7 * SECOND_NS // 2
 # A voltage counts for this time. Whoever has commanded a stage repeats its voltage within REPEAT_NS.
 QUIET_NS, REPEAT_NS = 3 * SECOND_NS // 2, 4 * SECOND_NS // 5
@@ -34,7 +34,7 @@ class Listening(Rule):
 
     def __init__(self, others: Callable[[], Sequence[str]]) -> None:
         self.playing = False  # a driver plays a block
-        self.thorough = False  # nothing moves before the middleware has found everybody, on a busy machine too
+        self.thorough = True  # nothing moves before the middleware has found everybody, on a busy machine too
         self._others = others
         self._beside: Sequence[str] = ()  # the others at the last look
         self._begun_ns = self._state_ns = 0  # the first `begin`, and when the stage was heard first

@@ -44,6 +44,7 @@ class Memory:
         try:
             saved = load_memory(self._file.path)
             if saved:
+                self._controller.ownership.left = None if self._file.used else saved.last_voltages
                 saved.require_fit(model, self._controller.names)
         except SlpiError as error:
             self._node.get_logger().warning(str(error))
@@ -85,7 +86,7 @@ class Memory:
         resets, ownership = self._reporter.settings.values["reset_on_start"], controller.ownership
         if resets and ownership.listening:
             # It goes over the whole range: first everybody is found.
-            ownership.listening.thorough = True
+            ownership.left = None
             controller.locate(time.monotonic_ns())
         # As soon as the voltages are known.
         self.waits = ownership.obstacle is not None

@@ -33,6 +33,7 @@ class Listening(Rule):
     """
 
     def __init__(self, others: Callable[[], Sequence[str]]) -> None:
+        self.on = False  # voltages of others are heard
         self.playing = False  # a driver plays a block
         self.thorough = True  # nothing moves before the middleware has found everybody, on a busy machine too
         self._others = others
@@ -41,10 +42,15 @@ class Listening(Rule):
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:
-        """Listen from now on."""
+        """Listen from now on, until `end`."""
+        self.on = True
         self._begun_ns = self._begun_ns or now_ns
-        self._known_ns = now_ns  # since when all of them have been known
         self._heard_ns: int | None = None
+        self.give_way(now_ns)
+
+    def give_way(self, now_ns: int) -> None:
+        """Listen anew, for a time of which a part is drawn: of two that speak at once, one begins before the other."""
+        self._known_ns = now_ns  # since when all of them have been known
         self._patience_ns = QUIET_NS + random.randrange(RANDOM_NS)
 
     def state(self, now_ns: int) -> None:
@@ -68,13 +74,21 @@ class Listening(Rule):
             return self._finding(f"{named} commands the stage; end it, or do not use this node")
         if not self.looks(now_ns):
             return self._finding("looking who else commands the stage; send it again")
-        if others and now_ns - self._known_ns < self._patience_ns:
+        if (others or self._heard_ns is not None) and now_ns - self._known_ns < self._patience_ns:
             return self._finding(f"listening whether {named} commands the stage; send it again")
         return None
 
+    def may_end(self, now_ns: int, begun_ns: int) -> bool:
+        """Return whether everybody is found, and who began when the output did, at a time (ns), has been heard."""
+        return self.found_all(now_ns) and now_ns - begun_ns >= QUIET_NS
+
+    def end(self) -> None:
+        """Listen no more: whoever speaks later has begun beside this node."""
+        self.on = False
+
     def heard_since(self, begun_ns: int) -> Finding | None:
         """Return that somebody else has commanded the stage since the output began at a time (ns)."""
-        if self._heard_ns is None or self._heard_ns <= begun_ns:
+        if not self.on or self._heard_ns is None or self._heard_ns <= begun_ns:
             return None
         named = ", ".join(self._others()) or "another node"
         return self._finding(f"{named} commands the stage too; end it, then call ~/arm")

@@ -38,7 +38,8 @@ class Ownership:
         self.monitor = Monitor(*(axis.amplifier for axis in axes))
         self._axes = axes
         self._starts = list(starts) or [AUTO] * len(axes)  # `AUTO`, `MEASURED`, `SAVED`, or volts
-        self._since_ns, self._heard_ns, self._begun_ns, self._ever = 0, 0, 0, False
+        self.begun_ns = 0  # when the output began
+        self._since_ns, self._heard_ns, self._ever = 0, 0, False
 
     @property
     def armed(self) -> bool:
@@ -125,7 +126,7 @@ class Ownership:
         if self.obstacle:
             raise RejectedError(*self.obstacle)
         if not self.started:
-            self.started, self._ever, self._begun_ns = True, True, now_ns
+            self.started, self._ever, self.begun_ns = True, True, now_ns
             for axis in self._axes:
                 self._take(axis, now_ns)
 
@@ -133,9 +134,10 @@ class Ownership:
         """Return whether somebody else has begun to move or to report an axis; nothing is then output until `arm`."""
         if not (self.started and self.armed):
             return False
-        found = self._stranger(now_ns) or (self.listening and self.listening.heard_since(self._begun_ns))
-        if found and self.listening and not self.listening.found_all(now_ns):
-            # Somebody who was there before, and whom the middleware has found only now.
+        found = self._stranger(now_ns) or (self.listening and self.listening.heard_since(self.begun_ns))
+        if found and self.listening and self.listening.on:
+            # Somebody who was there before and is found only now, or who has begun at the same time.
+            self.listening.give_way(now_ns)
             self.await_start(now_ns)
             return True
         if not found:
@@ -162,7 +164,7 @@ class Ownership:
             if reason := self._impossible(axis, voltage):
                 return f"axis '{axis.name}': {reason}"
             found.append(voltage)
-        self._begun_ns = now_ns
+        self.begun_ns = now_ns
         for axis, voltage in zip(self._axes, found, strict=True):
             # The last output of an axis that nobody moved is known better than a noisy report of it.
             if axis.amplifier.foreign or abs(voltage - axis.voltage) > axis.amplifier.scatter:

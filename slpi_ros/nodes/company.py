@@ -92,6 +92,7 @@ class Company:
         if self._commands is not None:
             self._node.destroy_subscription(self._commands)
             self._commands = None
+            self._listening.end()
             self.own.clear()
         if self._probe:
             self._probe.close()
@@ -101,7 +102,7 @@ class Company:
         """Look at the graph once a second; stop listening when a voltage has been output."""
         if self._ownership.started and self._commands is not None:
             self._controller.report((), (), now_ns)
-            if self._listening.found_all(now_ns):
+            if self._listening.may_end(now_ns, self._ownership.begun_ns):
                 self.close()
         elif not self._known_ns:
             # Whom the graph tells first is listened to from then on.

@@ -1,5 +1,6 @@
 """Who owns the voltage: what the amplifier reports, held against what was output."""
 
+import random
 from contextlib import suppress
 from math import inf, nan
 
@@ -430,10 +431,32 @@ def test_somebody_who_was_there_before_is_found_late():
     assert heard.made.ownership.obstacle[0] == STARTING
     # It never was the only one: without ~/arm it begins when the other one is silent.
     assert heard.moves(2.0) and heard.made.ownership.owned
-    # Later, somebody has begun beside it.
+    # Later, somebody has begun beside it: the reports tell whether the stage goes elsewhere.
     heard.moves(2.0)
+    assert heard.listening.may_end(heard.now_ns, heard.made.ownership.begun_ns)
+    heard.listening.end()
     heard.listening.hear(heard.now_ns)
-    assert not heard.moves(5.0) and not heard.made.ownership.armed
+    assert heard.moves(1.0) and heard.made.ownership.owned
+
+
+def test_two_that_begin_at_once_give_way_and_one_of_them_begins():
+    random.seed(3)
+    one, other = Heard(), Heard()
+    at, said = 30.0, []
+    for k in range(1000):
+        spoken = []
+        for each in (one, other):
+            each.at = at
+            if each.moves(0.01):
+                spoken.append(each)
+        for each in spoken:
+            # What is said is heard 50 ms later.
+            said.append((k + 5, other if each is one else one))
+            at = each.at
+        for due, listener in said:
+            if due == k:
+                listener.listening.hear(listener.now_ns)
+    assert one.made.ownership.owned != other.made.ownership.owned
 
 
 def test_a_publisher_that_has_said_nothing_yet_is_waited_for():

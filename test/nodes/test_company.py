@@ -56,6 +56,7 @@ def test_a_model_of_another_stage_moves_nothing(model_file):
     with compensator(model_file=model_file, start_voltage="auto") as client:
         reporting(client, frame="theirs")
         wait_for_obstacle(client, "'mine'", "'theirs'")
+        client.graph.spin_until(lambda: "'theirs'" in client.node.stderr, "that it is told without a command")
         assert insist(client, 2.0) == 0
 
 
@@ -115,6 +116,7 @@ def test_a_second_compensator_does_not_move_beside_a_running_one(model_file):
             client.graph.wait_for_status(
                 "/second: compensator", lambda status: "/compensator" in status.message, "the running one named"
             )
+            client.graph.spin_until(lambda: "/compensator" in second.stderr, "that it is told without a command")
             client.graph.spin_for(3.0)
             # The running one repeats its voltage; nothing else has moved.
             assert {answer[0] for answer in client.answers[-3:]} == {client.answers[-1][0]}

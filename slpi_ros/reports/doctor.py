@@ -144,7 +144,7 @@ def _of_publishers(graph: Graph) -> Iterator[Check]:
     if wrong:
         yield Check(FAILED, f"{topic}: of type {', '.join(sorted(wrong))}; publish {STATE_TYPE}")
     elif len(publishers) > 1:
-        yield Check(FAILED, f"{topic}: {len(publishers)} publishers: {', '.join(publishers)}; leave one")
+        yield Check(FAILED, f"{topic}: {len(publishers)} publishers: {', '.join(publishers)}; end all but one")
     elif not graph.stamps.size:
         yield Check(
             FAILED, f"{topic}: {', '.join(publishers)} sent nothing for {graph.seconds:.3g} s; make the driver publish"

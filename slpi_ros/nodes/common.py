@@ -41,9 +41,9 @@ COMMANDS = QoSProfile(depth=100, reliability=ReliabilityPolicy.RELIABLE)
 LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability=DurabilityPolicy.TRANSIENT_LOCAL)
 # Sensor data: only the newest message is relevant.
 MEASUREMENTS = qos_profile_sensor_data
-# What the middleware says of a node whose topics it has found, but not its name.
-UNNAMED = "_NODE_NAME_UNKNOWN_"
 DIAGNOSTICS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+# A node whose topics the middleware has found, but not its name: as the middleware calls it, and as it is called here.
+UNKNOWN, UNNAMED = "_NODE_NAME_UNKNOWN_", "a node of unknown name"
 # Freed memory that a process keeps: several times the size of a trajectory of a million points. Options of malloc.h.
 KEPT_BYTES, _M_TRIM_THRESHOLD, _M_MMAP_MAX = 2**29, -1, -4
 
@@ -149,9 +149,7 @@ def reliability_of(publishers: Sequence[Any]) -> ReliabilityPolicy:
 
 def full_name(namespace: str, name: str) -> str:
     """Return the full name of a node; the middleware knows the topics of a process before its names."""
-    if name == UNNAMED:
-        return "a node of unknown name"
-    return f"{namespace.rstrip('/')}/{name}"
+    return UNNAMED if name == UNKNOWN else f"{namespace.rstrip('/')}/{name}"
 
 
 def message_class(topic: str, msgtype: str) -> Any:

@@ -28,17 +28,18 @@ def graph_known(now_ns: int, begun_ns: int, state_ns: int) -> bool:
 class Listening(Rule):
     """Nobody else commands the stage, or the first voltage is held back: listens from `begin` on; steady clock, ns.
 
+    Others are being found since `found_from_ns`, by default since the first `begin`.
     `others` returns the other publishers of the topic of the voltages that the graph knows now. One that is silent,
     from when it was known on, may be a process that was killed.
     """
 
-    def __init__(self, others: Callable[[], Sequence[str]]) -> None:
+    def __init__(self, others: Callable[[], Sequence[str]], found_from_ns: int = 0) -> None:
         self.on = False  # voltages of others are heard
         self.playing = False  # a driver plays a block
         self.thorough = True  # nothing moves before the middleware has found everybody, on a busy machine too
         self._others = others
         self._beside: Sequence[str] = ()  # the others at the last look
-        self._begun_ns = self._state_ns = 0  # the first `begin`, and when the stage was heard first
+        self._begun_ns, self._state_ns = found_from_ns, 0  # of the search, and when the stage was heard first
         self.begin(0)
 
     def begin(self, now_ns: int) -> None:

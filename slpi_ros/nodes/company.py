@@ -48,14 +48,19 @@ class StateProbe:
 
 
 class Company:
-    """Who else is on the topics of a compensator: listens until its first voltage, then looks at the graph."""
+    """Who else is on the topics of a compensator, begun at a time (steady clock, ns).
 
-    def __init__(self, node: Node, controller: Controller) -> None:
+    Listens until its first voltage and for some time after that, then looks at the graph.
+    """
+
+    def __init__(self, node: Node, controller: Controller, begun_ns: int) -> None:
         self.newcomers: list[str] = []  # other publishers of the voltages that are alive, as far as is known
         self._node, self._controller, self._ownership = node, controller, controller.ownership
         self.own: set[bytes] = set()  # voltages of this node while it listens
         self._topics = {topic: node.resolve_topic_name(topic) for topic in (STATE, COMMAND)}
-        self._listening = self._ownership.listening = Listening(lambda: publishers_beside(node, self._topics[COMMAND]))
+        self._listening = self._ownership.listening = Listening(
+            lambda: publishers_beside(node, self._topics[COMMAND]), begun_ns
+        )
         self._commands: Any = None
         self._probe: StateProbe | None = None
         self._looked_ns = self._probed_ns = self._known_ns = 0  # of the graph, of the probe, when the graph was known

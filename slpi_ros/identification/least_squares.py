@@ -31,6 +31,7 @@ class Fitted:
     errors: FloatArray
     covered: float  # share of the parameters or loops that the samples determine
     validate: Callable[[], FloatArray]  # computes the held-out errors
+    again: Callable[[Sequence[Samples]], "Fitted"]  # the same fit to fewer of the samples, sought near this one
 
     @cached_property
     def held_out(self) -> FloatArray:
@@ -202,11 +203,14 @@ class Problem:
 
         Those next to the weight `near` are tried first: their scores tell that others need not be computed.
         """
-        best, start = near, among.index(near)
-        for smoothness in sorted(among, key=lambda each: abs(among.index(each) - start)):
-            score = self.score(smoothness, below)
-            if score < below:
-                best, below = smoothness, score
+        best, start, end = near, among.index(near), len(among)
+        for k in sorted(range(len(among)), key=lambda k: abs(k - start)):
+            if k < end:
+                score, beyond = self._scored(among[k], below)
+                # The error of a fit to all samples grows with the weight.
+                end = k if beyond else end
+                if score < below:
+                    best, below = among[k], score
         return best, below
 
     def score(self, smoothness: float, below: float = np.inf) -> float:
@@ -215,6 +219,10 @@ class Problem:
         It may be infinite where it is not less than `below` (m), which is known early: a fit to all samples with the
         same penalty has a smaller squared error on each fold than the fit to the others.
         """
+        return self._scored(smoothness, below)[0]
+
+    def _scored(self, smoothness: float, below: float) -> tuple[float, bool]:
+        """Return the score, and whether even the fit to all samples has an error of `below` (m) or more."""
         counts = np.array([self.count - fold.chosen.size for fold in self.folds])
         total = float(self.weights[np.concatenate([fold.chosen for fold in self.folds])].sum())
         lowest, squares = total * (below / self.scale) ** 2, np.zeros(len(self.folds))
@@ -224,11 +232,12 @@ class Problem:
             # The folds differ by a few samples, and so do their penalties.
             penalty = (x @ vector - x @ matrix @ x) * (counts / least - 1.0)
             squares = np.array([fold.error(x) for fold in self.folds]) - penalty
+        beyond = bool(squares.sum() >= lowest)
         for k in np.argsort(-squares).tolist():
             if squares.sum() >= lowest:
-                return np.inf
+                return np.inf, beyond
             squares[k] = self.folds[k].error(self._free(smoothness, int(counts[k]), self.folds[k]))
-        return float(np.sqrt(max(squares.sum(), 0.0) / total)) * self.scale
+        return float(np.sqrt(max(squares.sum(), 0.0) / total)) * self.scale, False
 
     def _free(self, smoothness: float, count: int, without: "Fold | None" = None) -> FloatArray:
         """Return the fit without constraints, and `without` a fold, with the penalty for `count` samples."""

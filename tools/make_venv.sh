@@ -13,7 +13,7 @@ case "$name" in
     '') versions='3.11 3.12' pins=requirements/lock.txt ;;
     jazzy) versions=3.12 pins='requirements/lock.txt requirements/jazzy.txt' ;;
     minimum) versions=3.11 pins='requirements/lock.txt requirements/jazzy.txt requirements/minimum.txt' ;;
-    newest) versions=3.12 pins= ;;
+    newest) versions='3.12 3.13' pins= ;;
     *) fail "no environment '$name'; give jazzy, minimum or newest" ;;
 esac
 venv=.venv${name:+-$name}

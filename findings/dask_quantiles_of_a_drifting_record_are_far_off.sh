@@ -9,7 +9,7 @@ set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 "${PYTHON:-python3}" -m venv "$folder/venv"
-"$folder/venv/bin/pip" install -q --disable-pip-version-check dask==2026.8.0 pandas==3.0.1 numpy==2.4.6 pyarrow==26.0.1
+"$folder/venv/bin/pip" install -q --no-compile --disable-pip-version-check dask==2026.8.0 pandas==3.0.1 numpy==2.4.6 pyarrow==26.0.1
 cd "$folder"
 venv/bin/python - <<'PY'
 import sys

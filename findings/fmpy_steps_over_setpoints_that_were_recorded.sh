@@ -8,7 +8,7 @@ set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 "${PYTHON:-python3}" -m venv "$folder/venv"
-"$folder/venv/bin/pip" install -q --disable-pip-version-check FMPy==0.3.32 numpy==2.4.6
+"$folder/venv/bin/pip" install -q --no-compile --disable-pip-version-check FMPy==0.3.32 numpy==2.4.6
 cd "$folder"
 cat >unit.c <<'C'
 #include <stddef.h>

@@ -10,7 +10,7 @@ set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 "${PYTHON:-python3}" -m venv "$folder/venv"
-"$folder/venv/bin/pip" install -q --disable-pip-version-check npTDMS==1.10.0 numpy==2.4.6
+"$folder/venv/bin/pip" install -q --no-compile --disable-pip-version-check npTDMS==1.10.0 numpy==2.4.6
 cd "$folder"
 venv/bin/python - <<'PY'
 import sys

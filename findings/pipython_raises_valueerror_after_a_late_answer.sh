@@ -10,7 +10,7 @@ set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 "${PYTHON:-python3}" -m venv "$folder/venv"
-"$folder/venv/bin/pip" install -q --disable-pip-version-check PIPython==2.11.0.6 pyserial==3.5 pyusb==1.3.1
+"$folder/venv/bin/pip" install -q --no-compile --disable-pip-version-check PIPython==2.11.0.6 pyserial==3.5 pyusb==1.3.1
 cd "$folder"
 venv/bin/python - <<'PY'
 import socket

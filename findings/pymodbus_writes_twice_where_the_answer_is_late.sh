@@ -9,7 +9,7 @@ set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 "${PYTHON:-python3}" -m venv "$folder/venv"
-"$folder/venv/bin/pip" install -q --disable-pip-version-check pymodbus==3.16.1
+"$folder/venv/bin/pip" install -q --no-compile --disable-pip-version-check pymodbus==3.16.1
 cd "$folder"
 venv/bin/python - <<'PY'
 import asyncio

@@ -9,7 +9,7 @@ set -eu
 folder=$(mktemp -d)
 trap 'rm -rf "$folder"' EXIT
 "${PYTHON:-python3}" -m venv "$folder/venv"
-"$folder/venv/bin/pip" install -q --disable-pip-version-check control==0.10.2 numpy==2.4.6 scipy==1.17.1
+"$folder/venv/bin/pip" install -q --no-compile --disable-pip-version-check control==0.10.2 numpy==2.4.6 scipy==1.17.1
 cd "$folder"
 venv/bin/python - <<'PY'
 import sys

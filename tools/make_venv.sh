@@ -9,13 +9,13 @@ cd "$(dirname "$0")/.."
 fail() { echo "slpi_ros: $*" >&2; exit 1; }
 
 # The pins of an environment: each file overrides versions of the file before it.
-name=${1:-} distro=jazzy
+name=${1:-} distro=jazzy preferred=
 case "$name" in
     '') versions='3.11 3.12' pins=requirements/lock.txt ;;
     jazzy) versions=3.12 pins='requirements/lock.txt requirements/jazzy.txt' ;;
     minimum) versions=3.11 pins='requirements/lock.txt requirements/jazzy.txt requirements/minimum.txt' ;;
-    newest) versions='3.12 3.13' pins= ;;
-    kilted) versions='3.12 3.13' pins= distro=kilted ;;
+    newest) versions='3.12 3.13' preferred=3.13 pins= ;;
+    kilted) versions='3.12 3.13' preferred=3.13 pins= distro=kilted ;;
     *) fail "no environment '$name'; give jazzy, minimum, newest or kilted" ;;
 esac
 venv=.venv${name:+-$name}
@@ -26,6 +26,8 @@ case "${ROS_DISTRO:-}" in
     "$distro") python=$(tools/find_python.sh "$versions" 'ensurepip, venv, rclpy' $venv/bin/python) && flavour=sourced || true ;;
     *) fail "ROS 2 $ROS_DISTRO is sourced, but $distro is needed: use a shell that sources $distro or no ROS at all" ;;
 esac
+# The preferred Python where it is there and no other one is asked for, though python3 would do.
+[ -z "$preferred" ] || [ -n "$python${PYTHON:-}" ] || python=$(tools/find_python.sh "$preferred" 'ensurepip, venv') || true
 [ -n "$python" ] || python=$(tools/find_python.sh "$versions" 'ensurepip, venv' $venv/bin/python) ||
     fail "no Python $(echo $versions | sed 's/ / or /') with venv among ${PYTHON:+$PYTHON, }python3, $(printf 'python%s, ' $versions)pyenv's and" \
         "uv's: install one (apt install python3-venv, or pyenv install 3.12), or run make with PYTHON=/path/to/python3.12"

@@ -64,6 +64,7 @@ def test_setup_py_and_the_ways_to_get_packages_name_the_same_ones():
         ("osqp", "identify bag -o other.json"),
         ("osqp", "diagnose bag --model model.json -o diagnosis"),
         ("rosbags", "import table.csv -o other"),
+        ("ruamel", "identify bag -o other.json"),
         ("pandas", "import table.csv -o other"),
         ("threadpoolctl", "refit model.json bag -o other.json"),
         ("jsonschema", "show wrong.json"),

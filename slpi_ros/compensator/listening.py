@@ -34,7 +34,6 @@ class Listening(Rule):
     """
 
     def __init__(self, others: Callable[[], Sequence[str]], found_from_ns: int = 0) -> None:
-        self.on = False  # voltages of others are heard
         self.playing = False  # a driver plays a block
         self.thorough = True  # nothing moves before the middleware has found everybody, on a busy machine too
         self._others = others
@@ -44,7 +43,7 @@ class Listening(Rule):
 
     def begin(self, now_ns: int) -> None:
         """Listen from now on, until `end`."""
-        self.on = True
+        self.on = True  # voltages of others are heard
         self._begun_ns = self._begun_ns or now_ns
         self._heard_ns: int | None = None
         self.give_way(now_ns)

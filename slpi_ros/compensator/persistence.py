@@ -1,6 +1,5 @@
 """Storage of the hysteresis memory of a stage between runs of the node, as a validated JSON document."""
 
-import fcntl
 import hashlib
 import json
 import os
@@ -14,6 +13,7 @@ from datetime import UTC, datetime
 
 from slpi_ros.errors import ModelError
 from slpi_ros.io.atomic_file import all_or_nothing, remove_file
+from slpi_ros.io.file_lock import lock
 from slpi_ros.io.input_limits import MEMORY_BYTES, MODEL_BYTES, open_input, read_input
 from slpi_ros.io.schemas import validate
 from slpi_ros.model.document import format_model
@@ -88,7 +88,7 @@ class LastVoltages:
         if not stat.S_ISREG(os.fstat(self._file).st_mode):
             os.close(self._file)
             raise ModelError(f"{self._path}: cannot be written: no regular file; choose another path")
-        if not _lock(self._file):
+        if not lock(self._file):
             os.close(self._file)
             raise ModelError(KEPT.format(path))
         os.ftruncate(self._file, 0)
@@ -109,22 +109,11 @@ class LastVoltages:
         os.close(self._file)
 
 
-def _lock(file: int) -> bool:
-    """Return whether no other process has locked an open file; it is then locked, where the file system can do that."""
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    except OSError:
-        return True
-    return True
-
-
 def is_kept(path: str | os.PathLike[str]) -> bool:
     """Return whether a living process keeps the last voltages of a saved memory."""
     try:
         with open_input(_beside(path), MEMORY_BYTES) as file:
-            return not _lock(file.fileno())
+            return not lock(file.fileno(), shared=True)
     except (OSError, ValueError):
         return False
 

@@ -138,7 +138,7 @@ class Wire:
         lower, upper = min(limits.lower for limits, _ in force), max(limits.upper for limits, _ in force)
         beyond = max(voltage - max(upper, self.voltage), min(lower, self.voltage) - voltage)
         ratios.note("outside", beyond - ROUNDING, what)
-        if step or self.limits.acceleration < inf:
+        if step or accelerated:
             self._before_ns = now_ns
         self.voltage = voltage
         if not accelerated:

@@ -117,6 +117,10 @@ class Life:
                     time.sleep(0.02)
                 time.sleep(0.3)
                 begun = self.amplifier.voltage
+                # It listens first whether somebody else commands the stage.
+                while len(self.amplifier.received) == self._judged and time.monotonic() < deadline:
+                    self.amplifier.send(self.share())
+                    time.sleep(0.05)
                 for _ in range(6):
                     self.rng.choice([self.points, self.stream, self.clocks, self.burst, self.follow, self.pause])()
                 time.sleep(0.2)

@@ -266,7 +266,8 @@ class Axis:
 
         `moved`: setpoints of a trajectory move the axis on.
         """
-        before, rate = self.voltage, self.output.rate
+        # Once the axis rests, limits that have waited for that are in force.
+        before, rate, moving = self.voltage, self.output.rate, self.output.in_motion
         if self.motion.due_ns is not None and self.motion.due_ns <= now_ns:
             if moved and self.motion.follows:
                 self.motion.due_ns = None
@@ -276,7 +277,7 @@ class Axis:
         if self.loop.active and self.motion.follows and self.loop.due_ns <= now_ns and desired is not None:
             v = self.loop.tick(desired, self.stream.voltage, self.stream.coupled, now_ns)
             self.amplifier.output(v, now_ns)
-        return self.voltage != before or (self.output.rate != rate and self.output.limits.acceleration < inf)
+        return self.voltage != before or (moving and self.output.rate != rate)
 
     # Voltages
 

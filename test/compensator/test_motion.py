@@ -307,3 +307,14 @@ def test_a_zero_that_is_set_in_motion_brakes():
     made.run(1.0)
     made.check()
     made.check_stands()
+
+
+def test_a_step_that_ends_at_rest_is_output_though_the_limits_that_waited_for_it_have_no_acceleration():
+    made = Bench(replace(GENTLE, acceleration=1e6))
+    made.send(0.1, TOP)
+    assert made.controller.axes[0].output.in_motion
+    made.controller.use_limits([replace(GENTLE, acceleration=np.inf)], made.now_ns)
+    given = len(made.given)
+    made.run(0.001)
+    assert len(made.given) == given + 1 and made.controller.axes[0].output.rate == 0.0
+    assert made.given[-1][1] == made.given[given - 1][1]

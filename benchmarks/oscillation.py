@@ -5,6 +5,7 @@ judged from outside, by the true displacement of the same loop with nothing that
 """
 
 import argparse
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -60,6 +61,7 @@ class Case:
     seed: int
     vibration: tuple[tuple[float, float], ...] = ()  # (Hz, m)
     forced: bool = True
+    late: float = 0.0  # s, by which a busy computer delays readings and voltages, mean of each
 
 
 @dataclass
@@ -85,6 +87,8 @@ def run(case: Case, seconds: float, path: Path, parameters: AxisParameters, watc
     rng = np.random.default_rng(case.seed)
     course = Course(np.empty(0))
     v, true, on = own.output.voltage, [], False
+    # What is on its way: when it is there (ns), and what (m or V).
+    readings, voltages = deque[tuple[int, float]](), deque[tuple[int, float]]()
     now = read_at = watch_at = sample_at = BEGIN_NS
     send_at, end = BEGIN_NS, BEGIN_NS + int(seconds * SECOND_NS)
     axis.step(0.0, v)
@@ -93,9 +97,14 @@ def run(case: Case, seconds: float, path: Path, parameters: AxisParameters, watc
         t = (at_ns - BEGIN_NS) * 1e-9
         return axis.step(t, v) + sum(size * sin(2 * pi * f * t) for f, size in case.vibration)
 
+    def send(queue: deque[tuple[int, float]], what: float) -> None:
+        at_ns = now + int(rng.exponential(case.late) * SECOND_NS) if case.late else now
+        queue.append((max(at_ns, queue[-1][0] if queue else 0), what))
+
     while now < end:
         due = made.next_due_ns(now, now)
-        now = min(read_at, watch_at, send_at, sample_at, max(due, now) if due is not None else end)
+        there = [queue[0][0] for queue in (readings, voltages) if queue]
+        now = min(read_at, watch_at, send_at, sample_at, *there, max(due, now) if due is not None else end)
         t = (now - BEGIN_NS) * 1e-9
         if not on and t >= 0.5:
             on = True
@@ -109,8 +118,10 @@ def run(case: Case, seconds: float, path: Path, parameters: AxisParameters, watc
             made.update(now, ["x"], [path(t)], now)
         elif now == read_at:
             read_at += round(SECOND_NS / case.rate)
+            send(readings, x + rng.normal(0.0, NOISE))
+        elif readings and readings[0][0] <= now:
             with suppress(RejectedError):
-                made.measure(["x"], [x + rng.normal(0.0, NOISE)], now)
+                made.measure(["x"], [readings.popleft()[1]], now)
         elif now == watch_at:
             watch_at += WATCH_NS
             made.watch(SAFETY, 0.5, now)
@@ -122,8 +133,10 @@ def run(case: Case, seconds: float, path: Path, parameters: AxisParameters, watc
                     break
         elif due is not None and due <= now:
             made.advance(now, now)
-        if own.output.voltage != v:
-            v = own.output.voltage
+        if own.output.voltage != (voltages[-1][1] if voltages else v):
+            send(voltages, own.output.voltage)
+        if voltages and voltages[0][0] <= now:
+            v = voltages.popleft()[1]
             axis.step(t, v)
     course.x = np.array(true)
     return course
@@ -156,7 +169,9 @@ def draw(rng: np.random.Generator, seed: int, model: AxisModel, slope: float) ->
     crossover = min(0.2 / total, 0.2 * 2.0 * damping * 2.0 * pi * frequency if mode else inf, 40.0)
     kp = 0.2 * 2.0 * damping / slope if mode and rng.integers(2) else 0.0
     gains = PidGains(kp, crossover / slope)
-    return Case(character, replace(model, effects=tuple(known)), gains, rate, period, seed), crossover
+    # Half of the computers are busy.
+    late = float(np.random.default_rng(seed).choice([0.0, 0.0, 1e-3, 3e-3]))
+    return Case(character, replace(model, effects=tuple(known)), gains, rate, period, seed, late=late), crossover
 
 
 def constant(t: float) -> float:
@@ -192,7 +207,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     model = identified(parameters)
     slope = float(np.ptp(model.displacement_range) / np.ptp(model.voltage_range))
     wrong = late = oscillated = shown = on = 0
-    print("  mode unknown  gains  amplitude/nm  Hz      begin/s  off after/s", flush=True)
+    print("  mode unknown  gains  late/ms  amplitude/nm  Hz      begin/s  off after/s", flush=True)
     for k in range(options.count):
         case, _ = draw(rng, 100 + k, model, slope)
         factor, unknown = float(10.0 ** rng.uniform(-1.0, np.log10(300.0))), bool(rng.integers(2))
@@ -215,7 +230,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
             on += "unstable" not in run(replace(case, forced=False), 2.0, constant, parameters).kind
         print(
             f"  {'yes' if case.character.resonance else 'no ':4} {'yes' if unknown else 'no ':7} {factor:6.2f} "
-            f"{size * 1e9:12.1f} {frequency:7.2f} {first:8.2f} {seen.off - first:8.2f} of {within:.2f} {seen.kind}"
+            f"{case.late * 1e3:8.0f} {size * 1e9:13.1f} {frequency:7.2f} {first:8.2f} "
+            f"{seen.off - first:8.2f} of {within:.2f} {seen.kind}"
             f"{'  LATE' if is_late else ''}{'  WRONG' if is_wrong else ''}",
             flush=True,
         )

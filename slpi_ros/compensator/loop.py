@@ -213,7 +213,7 @@ class Loop:
             if self.active:
                 aim = tracking.desired if desired is None else desired
                 if aim is not None:
-                    self.oscillation.take(x - aim, aim, now_ns)
+                    self.oscillation.take(x - aim, aim, (sensed[-1] if sensed else expected) - aim, now_ns)
             tracking.measure(x, desired)
 
     def switch_off(self, fault: Finding) -> None:

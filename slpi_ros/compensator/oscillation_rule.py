@@ -29,7 +29,7 @@ NEAR, LINES = 2.0**0.25, 2
 
 
 class Signals:
-    """Errors of the readings, and setpoints, of some last time (ns); m."""
+    """Errors of the readings, setpoints, and what the correction is expected to move, of some last time (ns); m."""
 
     def __init__(self, kept: float) -> None:  # s
         self._kept_ns = int(kept * SECOND_NS)
@@ -37,24 +37,24 @@ class Signals:
 
     def forget(self) -> None:
         """Begin anew."""
-        self._times, self._errors, self._setpoints = array("q"), array("d"), array("d")
+        self._times, self._values = array("q"), (array("d"), array("d"), array("d"))
 
-    def append(self, now_ns: int, error: float, setpoint: float) -> None:
-        """Take an error and a setpoint (m)."""
+    def append(self, now_ns: int, *values: float) -> None:
+        """Take an error, a setpoint and a motion (m)."""
         self._times.append(now_ns)
-        self._errors.append(error)
-        self._setpoints.append(setpoint)
+        for each, value in zip(self._values, values, strict=True):
+            each.append(value)
 
-    def last(self, seconds: float, now_ns: int) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Return times (s, from now), errors and setpoints (m) of the last `seconds`, shape (N,) each."""
+    def last(self, seconds: float, now_ns: int) -> tuple[FloatArray, ...]:
+        """Return times (s, from now), errors, setpoints and motions (m) of the last `seconds`, shape (N,) each."""
         times = np.array(self._times)
         old = int(np.searchsorted(times, now_ns - self._kept_ns))
         if old > times.size // 2:
-            for each in (self._times, self._errors, self._setpoints):
+            for each in (self._times, *self._values):
                 del each[:old]
             times = times[old:]
         k = int(np.searchsorted(times, now_ns - int(seconds * SECOND_NS)))
-        return (times[k:] - now_ns) * 1e-9, np.array(self._errors)[k:], np.array(self._setpoints)[k:]
+        return (times[k:] - now_ns) * 1e-9, *(np.array(each)[k:] for each in self._values)
 
 
 @lru_cache(maxsize=32)
@@ -88,9 +88,18 @@ class Spectrum:
         step = (n - 1) / n / (t[-1] - t[0])
         return cls(k * step, np.sqrt(power), np.sqrt(np.maximum(total[high + 1] - total[low], 0.0)), (low, high))
 
-    def amplitude(self, frequency: FloatArray | float) -> FloatArray:
-        """Return the amplitude (m) near frequencies (Hz)."""
-        return np.asarray(np.interp(frequency, self.frequencies, self.near))
+    def amplitude(self, of: "Oscillation") -> float:
+        """Return the amplitude (m) of what counts as an oscillation: what is near it, or all from the lowest one on."""
+        if not of.erratic:
+            return float(np.interp(of.frequency, self.frequencies, self.near))
+        k = int(np.searchsorted(self.frequencies, of.erratic, "right")) - 1
+        return float(np.linalg.norm(self.lines[k:]))
+
+    def erratic(self) -> "Oscillation":
+        """Return all that oscillates as one, with its mean frequency."""
+        power = self.lines[SHOWING:] ** 2
+        mean = float(np.average(self.frequencies[SHOWING:], weights=power)) if power.any() else 0.0
+        return Oscillation(mean, float(power.sum() ** 0.5), float(self.frequencies[SHOWING]))
 
     def frequency(self, k: int) -> float:
         """Return the frequency (Hz) of what shows in line k and those beside it."""
@@ -111,15 +120,21 @@ class Spectrum:
 
 @dataclass(frozen=True)
 class Oscillation:
-    """An oscillation that shows: frequency (Hz) and amplitude (m)."""
+    """An oscillation that shows: frequency (Hz) and amplitude (m); lowest frequency (Hz) of one without a period."""
 
     frequency: float
     amplitude: float
+    erratic: float = 0.0
+
+    @property
+    def slowest(self) -> float:
+        """Longest period (s)."""
+        return 1.0 / (self.erratic or self.frequency)
 
     @property
     def time(self) -> float:
         """Time (s) in which it has to be found."""
-        return max(SECONDS, PERIODS / self.frequency)
+        return max(SECONDS, PERIODS * self.slowest)
 
 
 class OscillationRule(Rule):
@@ -132,6 +147,10 @@ class OscillationRule(Rule):
     is kept as long as anything shows, and what is at most ``1 / LEAST_MARGIN`` times as large is let alone. Setpoints
     that move by more than that share of it within a period tell nothing. `noise` is that of the sensor, `span` the
     displacement range.
+
+    On a busy computer the delay of the loop varies, and an oscillation has no period: all that moves counts as one
+    then, if the correction moves nearly as much. (``|1 + L|`` below `LEAST_MARGIN` means ``|L|`` above
+    ``1 - LEAST_MARGIN``, the ratio of what the correction moves to the error.)
     """
 
     def __init__(self, span: float, noise: float = 0.0, axis: str = "") -> None:
@@ -159,15 +178,15 @@ class OscillationRule(Rule):
             self.begin(now_ns)
         self._on, self.held, self.noticed = on, on and self.held, on and self.noticed
 
-    def take(self, error: float, setpoint: float, now_ns: int) -> None:
-        """Take the error (m) of a reading, and the setpoint (m) that it is one of."""
+    def take(self, error: float, setpoint: float, moved: float, now_ns: int) -> None:
+        """Take error, setpoint and what the correction `moved` by the model, of a reading; m."""
         if not self._on:
             return
-        self._fast.append(now_ns, error, setpoint)
+        self._fast.append(now_ns, error, setpoint, moved)
         self._sum += error
         self._count += 1
         if now_ns - self._mean_ns >= MEAN_NS:
-            self._slow.append(now_ns, self._sum / self._count, setpoint)
+            self._slow.append(now_ns, self._sum / self._count, setpoint, moved)
             self._sum, self._count, self._mean_ns = 0.0, 0, now_ns
 
     def check(self, now_ns: int) -> Finding | None:
@@ -194,15 +213,26 @@ class OscillationRule(Rule):
         # A short time first; a longer one only where something moves in the longest.
         signals, fast, loud, self.noticed = self._fast.last(seconds, now_ns), True, False, False
         while fast or seconds <= min(LONGEST, elapsed):
-            t, error, setpoint = (each[signals[0] >= -seconds] for each in signals)
+            t, error, setpoint, moved = (each[signals[0] >= -seconds] for each in signals)
             # A sine of that amplitude has at least this spread.
             if t.size >= FEWEST and float(error.std()) * 2.0**0.5 > self._least:
                 loud = True
-                found = self._strongest(Spectrum.of(t, error), fast)
+                spectrum = Spectrum.of(t, error)
+                found = self._strongest(spectrum, fast)
                 if found and self._is_slow(t, setpoint, found):
                     self.noticed = self.noticed or found.amplitude > float(error.std())
                     if elapsed >= seconds and self._lasts(t, error, found):
                         return found
+                every = spectrum.erratic()
+                if (
+                    fast
+                    and elapsed >= seconds
+                    and self._stands_out(every)
+                    and self._is_slow(t, setpoint, every)
+                    and self._lasts(t, error, every)
+                    and Spectrum.of(t, moved).amplitude(every) >= (1.0 - LEAST_MARGIN) * every.amplitude
+                ):
+                    return every
             if fast:
                 signals, fast = self._slow.last(LONGEST, now_ns), False
                 if not signals[1].size or float(np.ptp(signals[1])) <= self._least:
@@ -218,7 +248,7 @@ class OscillationRule(Rule):
             found = Oscillation(spectrum.frequency(k), float(spectrum.near[k]))
             if found.amplitude <= self._least:
                 break
-            if self._alone and found.amplitude <= float(self._alone.amplitude(found.frequency)) / LEAST_MARGIN:
+            if not self._stands_out(found):
                 continue
             if k == SHOWING or (fast and k > SHOWING):
                 return found
@@ -226,18 +256,20 @@ class OscillationRule(Rule):
                 break
         return None
 
+    def _stands_out(self, found: Oscillation) -> bool:
+        """Return whether an oscillation counts, and is not there without feedback."""
+        alone = self._alone.amplitude(found) if self._alone else 0.0
+        return found.amplitude > max(self._least, alone / LEAST_MARGIN)
+
     def _is_slow(self, t: FloatArray, setpoint: FloatArray, of: Oscillation) -> bool:
         """Return whether setpoints (m, (N,)) move so little within a period that they cannot explain the judgement."""
-        later = np.searchsorted(t, t + 1.0 / of.frequency).clip(max=t.size - 1)
+        later = np.searchsorted(t, t + of.slowest).clip(max=t.size - 1)
         return bool(np.max(np.abs(setpoint[later] - setpoint), initial=0.0) < LEAST_MARGIN * of.amplitude)
 
     def _lasts(self, t: FloatArray, error: FloatArray, of: Oscillation) -> bool:
         """Return whether it has begun long enough ago, and is not gone by itself after the time for it, as it falls."""
         half = t.size // 2
-        first, second = (
-            float(Spectrum.of(t[part], error[part]).amplitude(of.frequency))
-            for part in (slice(half), slice(half, None))
-        )
+        first, second = (Spectrum.of(t[part], error[part]).amplitude(of) for part in (slice(half), slice(half, None)))
         share = LEAST_MARGIN * of.amplitude
         ahead = of.time / max(float(t[-1] - t[half]), 1e-9)
         return first > share and second * min(second / first, 1.0) ** ahead > max(self._least, share)
@@ -248,17 +280,18 @@ class OscillationRule(Rule):
         if since < HELD * shown.time:
             return
         fast = shown.time <= SECONDS
-        t, error, setpoint = self._fast.last(min(since, SECONDS), now_ns) if fast else self._slow.last(since, now_ns)
+        t, error, setpoint, _ = self._fast.last(min(since, SECONDS), now_ns) if fast else self._slow.last(since, now_ns)
         if t.size < FEWEST or not self._is_slow(t, setpoint, shown):
             self._end(now_ns, self._alone)
             return
         # What rings down is before the last half, or the last period.
-        last = t >= -max(0.5 * since, 1.0 / shown.frequency)
+        last = t >= -max(0.5 * since, shown.slowest)
         alone = Spectrum.of(t[last], error[last])
-        if float(alone.amplitude(shown.frequency)) < LEAST_MARGIN * shown.amplitude:
+        if alone.amplitude(shown) < LEAST_MARGIN * shown.amplitude:
+            about = "about " if shown.erratic else ""
             reason = (
-                f"it oscillated at {shown.frequency:.3g} Hz by {shown.amplitude * 1e9:.3g} nm, and no more while the "
-                "correction was held"
+                f"it oscillated at {about}{shown.frequency:.3g} Hz by {shown.amplitude * 1e9:.3g} nm, and no more "
+                "while the correction was held"
             )
             self._found = Finding("oscillation", "oscillating", reason, self.axis)
         elif self._lasts(t, error, shown):

@@ -23,7 +23,9 @@ from slpi_ros.model.stage_model import StageModel
 MS, NOISE, SLOPE = 1_000_000, 5e-9, 1e-7
 
 
-def watched(error, seconds, rate=1000.0, setpoint=lambda t: 0.0, held=lambda t, since: 0.0, noise=NOISE):
+def watched(
+    error, seconds, rate=1000.0, setpoint=lambda t: 0.0, held=lambda t, since: 0.0, noise=NOISE, moved=lambda t: 0.0
+):
     """Return what the rule finds, when (s), and when the correction had to be held (s).
 
     `error` (m) at a time (s) is what feedback sustains or sees; `held` is what is left of it when the correction has
@@ -45,7 +47,7 @@ def watched(error, seconds, rate=1000.0, setpoint=lambda t: 0.0, held=lambda t, 
             elif not rule.held:
                 since = inf
         y = error(t) if since == inf else held(t, since)
-        rule.take(y + rng.normal(0.0, noise), setpoint(t), now_ns)
+        rule.take(y + rng.normal(0.0, noise), setpoint(t), moved(t) if since == inf else 0.0, now_ns)
     return None, inf, holds
 
 
@@ -121,6 +123,34 @@ def test_an_oscillation_beside_hum_is_found():
     assert float(found.reason.split("at ")[1].split()[0]) == pytest.approx(17.0, abs=0.5)
 
 
+def erratic(size, low=20.0, high=150.0):
+    """Return what oscillates as a loop does whose delay varies: with another frequency (Hz) every 20 ms."""
+    frequencies = np.random.default_rng(6).uniform(low, high, 2000)
+    phases = np.append(0.0, np.cumsum(2 * pi * 0.02 * frequencies))
+    return lambda t: size * np.sin(np.interp(t, 0.02 * np.arange(phases.size), phases))
+
+
+@pytest.mark.parametrize("size", [5.0 * NOISE, 2e-6])
+def test_an_oscillation_without_a_period_is_found_in_time(size):
+    """The computer is busy, and the delay of the loop varies."""
+    wave = erratic(size)
+    found, t, holds = watched(wave, 8.0, moved=wave)
+    assert (found.rule, found.kind) == ("oscillation", "oscillating") and t <= 2.0 and len(holds) == 1
+    told = found.reason.replace(",", "").split()
+    assert float(told[told.index("Hz") - 1]) == pytest.approx(85.0, rel=0.3)
+    assert float(told[told.index("nm") - 1]) * 1e-9 == pytest.approx(size, rel=0.3)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.5])
+def test_what_has_no_period_is_let_alone_where_the_correction_moves_less(share):
+    """A vibration that the loop hardly follows, also one that ends while the correction is held."""
+    wave = erratic(5.0 * NOISE)
+    found, _, holds = watched(wave, 8.0, moved=lambda t: share * wave(t))
+    assert found is None and not holds
+    found, _, holds = watched(wave, 8.0, held=lambda t, since: wave(t), moved=wave)
+    assert found is None and len(holds) <= 5
+
+
 def test_setpoints_that_move_tell_nothing():
     for path in (lambda t: 1e-6 * (int(2 * t) % 2), lambda t: 1e-6 * np.sin(2 * pi * 5.0 * t)):
         found, _, holds = watched(lambda t, path=path: 0.05 * path(t), 10.0, setpoint=path)
@@ -133,11 +163,11 @@ def test_a_reset_or_other_gains_begin_anew():
     rule = OscillationRule(10e-6, NOISE)
     rule.watch(True, 0)
     for k in range(900):
-        rule.take(1e-6 * np.sin(0.3 * k), 0.0, k * MS)
+        rule.take(1e-6 * np.sin(0.3 * k), 0.0, 0.0, k * MS)
     rule.begin(900 * MS)
     assert rule.check(1800 * MS) is None and not rule.held
     rule.watch(False, 1900 * MS)
-    rule.take(1.0, 0.0, 1901 * MS)
+    rule.take(1.0, 0.0, 0.0, 1901 * MS)
     assert rule.check(1950 * MS) is None and not rule.noticed
 
 

@@ -241,7 +241,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         switched, held = 0, 0.0
         for k in range(options.count // 2):
             case, crossover = draw(rng, 500 + k, model, slope)
-            case = replace(case, forced=False)
+            case = replace(case, forced=False, late=0.0)
             if "hum" in what:
                 lines = (float(rng.choice([50.0, 60.0])), float(np.exp(rng.uniform(np.log(3.0), np.log(200.0)))))
                 case = replace(case, vibration=((lines[0], 60e-9), (lines[1], 60e-9)))

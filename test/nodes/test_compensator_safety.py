@@ -55,8 +55,10 @@ def test_silence_leads_to_the_safe_voltage_and_the_next_command_takes_over_from_
         assert (np.diff(way) < 0).all() and np.abs(np.diff(way)).max() <= 2.0 * RAMP_RATE * PERIOD + 1e-9
         # Timers are late on a busy machine: not every period has its own step.
         assert len(way) > 0.2 * (before - 10.0) / RAMP_RATE / PERIOD
-        # A new path starts where the ramp has ended.
-        assert 10.0 < client.ask(["x"], [5e-6])[0] <= 10.0 + 2.0 * 2000 * PERIOD + 1e-9
+        # A new path starts where the ramp has ended. A voltage that is repeated, so that it is heard, is no answer.
+        while (first := client.ask(["x"], [5e-6])[0]) == 10.0:
+            pass
+        assert 10.0 < first <= 10.0 + 2.0 * 2000 * PERIOD + 1e-9
 
 
 def test_a_command_ends_a_ramp(x_file):

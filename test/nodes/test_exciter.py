@@ -355,7 +355,10 @@ def test_it_returns_when_another_publisher_appears():
         listener.wait_for_motion()
         graph.node.create_publisher(Float64MultiArray, "voltage_command", RELIABLE)
         assert wait_for_end(graph, node) == 1
-        assert holds(node.stderr.splitlines()[-1], "1 other publisher", "voltage_command", graph.node.get_name())
+        # On a busy machine its name is heard of later than the publisher.
+        told = node.stderr.splitlines()[-1]
+        assert holds(told, "1 other publisher", "voltage_command")
+        assert graph.node.get_name() in told or "unknown name" in told
         v = listener.v
     assert v[-1, 0] == pytest.approx(0.0, abs=1e-9) and v.max() > 60.0
     assert fastest(v) <= 2 * 400.0 * (1 + 1e-9) and len(v) < 20.0 * RATE

@@ -4,6 +4,7 @@ from collections import deque
 from dataclasses import dataclass, fields
 from math import exp, expm1, inf, isfinite, sqrt
 
+from slpi_ros.compensator.loop_filter import LoopFilter, Notch, States
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.model.limits import MAX_DT, RateLimiter
 
@@ -21,12 +22,21 @@ class PidGains:
     integral: float = 0.0  # V/(m s)
     derivative: float = 0.0  # V s/m; on the measured displacement only, not on the setpoint
     derivative_filter: float = 0.0  # s, time constant of its low-pass filter; 0: none
+    measurement_filter: float = 0.0  # s, time constant of the low-pass filter of the readings; 0: none
+    notches: tuple[Notch, ...] = ()  # of the readings
 
     def __post_init__(self) -> None:
         for field in fields(self):
+            if field.name == "notches":
+                continue
             value = getattr(self, field.name)
             if not (isfinite(value) and value >= 0.0):
                 raise UsageError(f"PID gain {field.name} is {value}; give a finite value that is not negative")
+
+    @property
+    def filters(self) -> bool:
+        """Whether readings are filtered."""
+        return bool(self.notches or self.measurement_filter)
 
     def direct(self, error: float, rate: float) -> float:
         """Return the part of the correction (V) that an error (m) and a measured rate (m/s) make at once."""
@@ -44,6 +54,9 @@ class Feedback:
     #
     # Windup is avoided by conditional integration: the integral grows only as far as the voltage can follow. Unlike
     # back-calculation, this keeps the integral while the voltage is slew limited on the way to a distant feedforward.
+    #
+    # Notches and low pass take the error, reading and setpoint alike, so that their lag is no error while the stage
+    # moves. They step once in each period of `pace`, whose filters they are, also over periods without a measurement.
     #
     # The error refers to the setpoint at the time of the measurement, not to the present one, and for a sensor with a
     # known delay or lag to the setpoint as that sensor would tell it, see `slpi_ros.model.sensor.Sensed`.
@@ -66,6 +79,11 @@ class Feedback:
         self._last_ns = self._measured_ns = self._latest_ns = -inf
         self._latest: tuple[float, float | None] | None = None  # that one (m), and the setpoint (m) at that time
         self._desired: float | None = None
+        # Filter of the gains at the period of `pace`, its states for error and reading, and the time it has come to.
+        self._filter: LoopFilter | None = None
+        self._errors: States = []
+        self._readings: States = []
+        self._filtered_ns = 0
 
     def switch(self, on: bool) -> None:
         """Enable the PID without a voltage step at the next measurement; once it is off, the correction decays."""
@@ -82,6 +100,8 @@ class Feedback:
     def retune(self, gains: PidGains) -> None:
         """Replace the gains without a voltage step, or raise and keep them if they give no finite voltage."""
         error, rate = self._error, self._rate
+        if (gains.notches, gains.measurement_filter) != (self.gains.notches, self.gains.measurement_filter):
+            self._filter = None
         offset = self._offset + (self.gains.direct(error, rate) - gains.direct(error, rate))
         if not isfinite(offset):
             raise UsageError(f"{gains} give no finite voltage; check their units")
@@ -91,7 +111,10 @@ class Feedback:
         """Return the voltage (V) for desired and measured displacement (m), within all limits, or raise unchanged."""
         self._require_order(now_ns)
         elapsed = (now_ns - self._measured_ns) * 1e-9
-        error, rate = desired - measured, self._next_rate(elapsed, measured)
+        error, filtered = desired - measured, self._filtered(now_ns, elapsed, desired - measured, measured)
+        if filtered:
+            (error, errors), (measured, readings), filtered_ns = filtered
+        rate = self._next_rate(elapsed, measured)
         direct = self.gains.direct(error, rate)
         if not isfinite(direct):
             raise UsageError(f"desired {desired} m, measured {measured} m gives no finite voltage; hold the sample")
@@ -107,7 +130,33 @@ class Feedback:
         self._error, self._rate = error, rate
         if elapsed > 0.0:
             self._measured_ns, self._measured = now_ns, measured
+        if filtered:
+            self._errors, self._readings, self._filtered_ns = errors, readings, filtered_ns
         return v
+
+    def _filtered(
+        self, now_ns: int, elapsed: float, error: float, measured: float
+    ) -> tuple[tuple[float, States], tuple[float, States], int] | None:
+        """Return error and reading (m) after the filter, each with its states, and the time it comes to; None: none."""
+        gains, pace = self.gains, self.pace
+        if not gains.filters or not isfinite(error):
+            return None
+        found = self._filter
+        anew = elapsed > self.longest_gap
+        if found is None or found.period != pace.period:
+            found = self._filter = LoopFilter(gains.notches, gains.measurement_filter, pace.period)
+            # Without a step: as if the last filtered error had always been there.
+            self._errors, self._readings = found.at_rest(self._error), found.at_rest(self._measured)
+            self._filtered_ns = max(now_ns - pace.period_ns, 0)
+        if anew:
+            return (error, found.at_rest(error)), (measured, found.at_rest(measured)), now_ns
+        if elapsed == 0.0:
+            return (self._error, self._errors), (self._measured, self._readings), self._filtered_ns
+        steps = max(round((now_ns - self._filtered_ns) / pace.period_ns), 1)
+        errors = found.after(self._errors, error, steps)
+        # Only the derivative takes the reading itself.
+        readings = found.after(self._readings, measured, steps) if gains.derivative else (measured, self._readings)
+        return errors, readings, min(self._filtered_ns + steps * pace.period_ns, now_ns + pace.period_ns)
 
     def hold(self, now_ns: int, feedforward: float) -> float:
         """Return the voltage (V) without measurement, or raise unchanged: the correction is kept, or decays."""

@@ -4,7 +4,7 @@ from collections import deque
 from dataclasses import dataclass, fields
 from math import exp, expm1, inf, isfinite, sqrt
 
-from slpi_ros.compensator.loop_filter import LoopFilter, Notch, States
+from slpi_ros.compensator.loop_filter import Filtered, LoopFilter, Notch
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.model.limits import MAX_DT, RateLimiter
 
@@ -79,11 +79,9 @@ class Feedback:
         self._last_ns = self._measured_ns = self._latest_ns = -inf
         self._latest: tuple[float, float | None] | None = None  # that one (m), and the setpoint (m) at that time
         self._desired: float | None = None
-        # Filter of the gains at the period of `pace`, its states for error and reading, and the time it has come to.
+        # Filter of the gains at the period of `pace`, and what it has come to.
         self._filter: LoopFilter | None = None
-        self._errors: States = []
-        self._readings: States = []
-        self._filtered_ns = 0
+        self._filtered: Filtered
 
     def switch(self, on: bool) -> None:
         """Enable the PID without a voltage step at the next measurement; once it is off, the correction decays."""
@@ -111,9 +109,9 @@ class Feedback:
         """Return the voltage (V) for desired and measured displacement (m), within all limits, or raise unchanged."""
         self._require_order(now_ns)
         elapsed = (now_ns - self._measured_ns) * 1e-9
-        error, filtered = desired - measured, self._filtered(now_ns, elapsed, desired - measured, measured)
-        if filtered:
-            (error, errors), (measured, readings), filtered_ns = filtered
+        error = desired - measured
+        if filtered := self._filter_next(now_ns, elapsed, error, measured):
+            error, measured = filtered.error, filtered.reading
         rate = self._next_rate(elapsed, measured)
         direct = self.gains.direct(error, rate)
         if not isfinite(direct):
@@ -131,32 +129,32 @@ class Feedback:
         if elapsed > 0.0:
             self._measured_ns, self._measured = now_ns, measured
         if filtered:
-            self._errors, self._readings, self._filtered_ns = errors, readings, filtered_ns
+            self._filtered = filtered
         return v
 
-    def _filtered(
-        self, now_ns: int, elapsed: float, error: float, measured: float
-    ) -> tuple[tuple[float, States], tuple[float, States], int] | None:
-        """Return error and reading (m) after the filter, each with its states, and the time it comes to; None: none."""
+    def _filter_next(self, now_ns: int, elapsed: float, error: float, measured: float) -> Filtered | None:
+        """Return error and reading (m) after the filter; None if there is none."""
         gains, pace = self.gains, self.pace
         if not gains.filters or not isfinite(error):
             return None
         found = self._filter
-        anew = elapsed > self.longest_gap
         if found is None or found.period != pace.period:
             found = self._filter = LoopFilter(gains.notches, gains.measurement_filter, pace.period)
             # Without a step: as if the last filtered error had always been there.
-            self._errors, self._readings = found.at_rest(self._error), found.at_rest(self._measured)
-            self._filtered_ns = max(now_ns - pace.period_ns, 0)
-        if anew:
-            return (error, found.at_rest(error)), (measured, found.at_rest(measured)), now_ns
+            self._filtered = found.resting(self._error, self._measured, max(now_ns - pace.period_ns, 0))
+        before = self._filtered
+        if elapsed > self.longest_gap:
+            return found.resting(error, measured, now_ns)
         if elapsed == 0.0:
-            return (self._error, self._errors), (self._measured, self._readings), self._filtered_ns
-        steps = max(round((now_ns - self._filtered_ns) / pace.period_ns), 1)
-        errors = found.after(self._errors, error, steps)
+            return before
+        steps = max(round((now_ns - before.now_ns) / pace.period_ns), 1)
+        end_ns = min(before.now_ns + steps * pace.period_ns, now_ns + pace.period_ns)
+        error, errors = found.after(before.errors, error, steps)
         # Only the derivative takes the reading itself.
-        readings = found.after(self._readings, measured, steps) if gains.derivative else (measured, self._readings)
-        return errors, readings, min(self._filtered_ns + steps * pace.period_ns, now_ns + pace.period_ns)
+        readings = before.readings
+        if gains.derivative:
+            measured, readings = found.after(readings, measured, steps)
+        return Filtered(error, measured, errors, readings, end_ns)
 
     def hold(self, now_ns: int, feedforward: float) -> float:
         """Return the voltage (V) without measurement, or raise unchanged: the correction is kept, or decays."""

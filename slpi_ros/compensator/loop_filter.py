@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from math import exp, isfinite, pi, tan
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,6 +90,16 @@ def response(filters: tuple[Section, ...], z: NDArray[np.complex128]) -> NDArray
     return found
 
 
+class Filtered(NamedTuple):
+    """Error and reading (m) after the filter, its states for each, and the time (ns) that they are of."""
+
+    error: float
+    reading: float
+    errors: States
+    readings: States
+    now_ns: int
+
+
 class LoopFilter:
     """Sections in a row for one signal, at a fixed period (s); the caller keeps the states."""
 
@@ -100,6 +111,10 @@ class LoopFilter:
     def at_rest(self, u: float) -> States:
         """Return the states for an input that has always been `u`, as the output then is."""
         return [each.at_rest(u) for each in self.sections]
+
+    def resting(self, error: float, reading: float, now_ns: int) -> Filtered:
+        """Return what an error and a reading (m) come to that have always been there."""
+        return Filtered(error, reading, self.at_rest(error), self.at_rest(reading), now_ns)
 
     def after(self, states: States, u: float, steps: int) -> tuple[float, States]:
         """Return output and states after `steps` (1 or more) periods with the input `u`."""

@@ -98,7 +98,7 @@ class DiscreteLoop:
     @np.errstate(over="ignore", invalid="ignore")
     def response(self, omega: FloatArray) -> ComplexArray:
         """Return the return ratio L, shape (N,), at `omega` (rad/s, 0 to pi / period)."""
-        kept, early, late = self._held
+        kept, early, late = self.held
         z, whole = np.exp(1j * omega * self.period), ceil(self.plant.delay / self.period)
         direct = self.plant.dynamics.d
         reading = np.full(omega.shape, direct, dtype=complex)
@@ -109,7 +109,7 @@ class DiscreteLoop:
         return np.asarray(self.controller(omega) * self.plant.slope * reading * z ** -(whole + 1.0))
 
     @cached_property
-    def _held(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def held(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """States after a period, and what comes in of the newer and of the older voltage, as the delay is."""
         (a, b, _, _), period = self.plant.dynamics, self.period
         older = self.plant.delay - (ceil(self.plant.delay / period) - 1) * period

@@ -62,7 +62,7 @@ def commands(inputs):
         "excite": (EXCITE, "t.csv"),
         "simulate": (("simulate", model, inputs / "voltage.csv"), "t.csv"),
         "compensate": (("compensate", model, inputs / "desired.csv"), "t.csv"),
-        "tune": (("tune", model), "g.yaml"),
+        "tune": (("tune", model), "m.yaml"),
     }
 
 

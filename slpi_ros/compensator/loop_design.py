@@ -1,6 +1,6 @@
 """Design of the closed loop of one axis: gains, notches and low pass of the largest bandwidth at a modulus margin."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
@@ -12,9 +12,7 @@ from slpi_ros.arrays import FloatArray
 from slpi_ros.compensator.feedback import PidGains
 from slpi_ros.compensator.loop_filter import LoopFilter, Notch, response, sections
 from slpi_ros.compensator.loop_margin import BESIDE, ComplexArray, DiscreteLoop, Plant
-from slpi_ros.effects.base import Effect
 from slpi_ros.effects.filters import Mode
-from slpi_ros.effects.resonance import Resonance
 from slpi_ros.errors import ModelError, UsageError
 from slpi_ros.model.axis_model import AxisModel
 
@@ -24,8 +22,8 @@ MARGIN, MARGINS, DETUNING = 0.5, (0.3, 0.9), 0.1
 MESSAGES = 3e-4
 # The margin is kept where the slope is larger by this share than the steepest of the model.
 STEEPER = 0.05
-# At most so many standard uncertainties less damping, and at least this share of it.
-UNCERTAIN, LEAST_DAMPING = 2.0, 0.5
+# So many standard uncertainties less damping.
+UNCERTAIN = 2.0
 # Detunings of all modes alike, and most modes of which all combinations are looked at.
 STEPS, COMBINED = 9, 3
 # The lowest frequency over the slowest rate of the loop, and the number of frequencies.
@@ -63,7 +61,7 @@ class Loop:
         nominal = Plant.of(model)
         if not (isfinite(nominal.slope) and nominal.slope > 0.0):
             raise ModelError(f"the model has a slope of {nominal.slope:g} m/V; identify it from a record that moves")
-        modes = tuple(mode for effect in model.effects if isinstance(effect, Resonance) for mode in effect.modes)
+        modes = tuple(mode for effect in model.effects for mode in effect.ringing)
         for mode in modes:
             if not mode.frequency * period < 0.5:
                 raise UsageError(
@@ -242,15 +240,13 @@ def design(model: AxisModel, rate: float, margin: float = MARGIN) -> Design:
 def _corners(model: AxisModel, nominal: Plant) -> Iterator[Plant]:
     """Yield the plants that a model may mean as well."""
     steep = nominal.slope * (1.0 + STEEPER)
-    for scales in _detunings(sum(len(each.modes) for each in model.effects if isinstance(each, Resonance))):
-        for weaker in (False, True) if scales else (False,):
-            changed, left = [], list(scales)
+    for scales in _detunings(sum(len(each.ringing) for each in model.effects)):
+        for uncertain in (0.0, UNCERTAIN) if scales else (0.0,):
+            changed, left = [], scales
             for effect in model.effects:
-                if isinstance(effect, Resonance):
-                    own, left = left[: len(effect.modes)], left[len(effect.modes) :]
-                    changed.append(_detuned(effect, own, weaker))
-                else:
-                    changed.append(effect)
+                count = len(effect.ringing)
+                changed.append(effect.detuned(left[:count], uncertain))
+                left = left[count:]
             dynamics = nominal.dynamics if not scales else Plant.of(replace(model, effects=tuple(changed))).dynamics
             for later in (0.0, MESSAGES):
                 yield Plant(steep, nominal.delay + later, dynamics)
@@ -269,20 +265,10 @@ def _detunings(count: int) -> list[tuple[float, ...]]:
     return sorted(found)
 
 
-def _detuned(effect: Resonance, scales: Sequence[float], weaker: bool) -> Effect:
-    """Return modes with scaled frequencies and, if `weaker`, the least damping that they may have."""
-    modes = []
-    for k, (mode, scale) in enumerate(zip(effect.modes, scales, strict=True)):
-        unsure = effect.uncertainty.get(f"modes.{k}.damping", 0.0)
-        least = max(mode.damping - UNCERTAIN * unsure, LEAST_DAMPING * mode.damping)
-        modes.append(replace(mode, frequency=mode.frequency * scale, damping=least if weaker else mode.damping))
-    return replace(effect, modes=tuple(modes))
-
-
 def _relieved(model: AxisModel, loop: Loop) -> Iterator[tuple[str, Loop]]:
     """Yield loops without one of the things that may limit the bandwidth."""
     if loop.modes:
-        rigid = replace(model, effects=tuple(each for each in model.effects if not isinstance(each, Resonance)))
+        rigid = replace(model, effects=tuple(each for each in model.effects if not each.ringing))
         yield "mode", Loop.of(rigid, loop.period)
     if loop.nominal.delay > 0.0:
         yield (

@@ -1,0 +1,242 @@
+"""Loops tuned without a hand on simulated stages of other physics: bandwidth, margin, detuned modes, a raster.
+
+Each stage (Preisach hysteresis, a mode of 60 to 600 Hz with a damping of 0.005 to 0.5, 0.2 to 5 ms of delay, sensor and
+loop at six times the mode to 5 kHz) is identified and diagnosed from two records, `slpi_ros.compensator.loop_design`
+makes the gains, and the compensator's controller closes the loop on the stage. Sensitivity is measured with a multisine
+on the reading. Today's rule is ``ki g = min(2 d w / 5, 0.2 / delay)`` with the true numbers; its bandwidth is that of
+the linear loop with the slope that the tuned loop has shown.
+"""
+
+import argparse
+import time
+from collections.abc import Callable, Sequence
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from math import log, pi
+
+import numpy as np
+
+from slpi_ros.compensator.controller import Controller
+from slpi_ros.compensator.feedback import LoopSettings, PidGains
+from slpi_ros.compensator.loop_design import HALF, Loop, Shape, design
+from slpi_ros.compensator.loop_margin import DiscreteLoop
+from slpi_ros.compensator.validation import RejectedError
+from slpi_ros.diagnosis.diagnose import diagnose
+from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.filters import Mode
+from slpi_ros.effects.resonance import Resonance
+from slpi_ros.excitation.drives import excite
+from slpi_ros.identification.fit import identify
+from slpi_ros.io.record import Record
+from slpi_ros.model.axis_model import AxisModel
+from slpi_ros.model.limits import Limits
+from slpi_ros.model.stage_model import StageModel
+from slpi_ros.simulation.axis import SimulatedAxis
+from slpi_ros.simulation.character import Character
+from slpi_ros.simulation.parameters import AxisParameters
+
+BEGIN_NS, SECOND_NS = 10**12, 10**9
+LIMITS = Limits(0.0, 100.0)
+# Samples of the records; rms of the multisine and size of the raster (shares of the stroke), its frequency (Hz), s.
+SAMPLES, MULTISINE, RASTER = 14_000, 0.01, (0.3, 5.0, 2.0)
+Signal = Callable[[float], float]
+
+
+@dataclass(frozen=True)
+class Stage:
+    """One simulated stage with its loop."""
+
+    parameters: AxisParameters
+    character: Character
+    rate: float  # Hz
+    seed: int
+
+    @classmethod
+    def drawn(cls, seed: int) -> "Stage":
+        """Return the stage of a seed."""
+        rng = np.random.default_rng([69, seed])
+
+        def between(low: float, high: float) -> float:
+            return float(np.exp(rng.uniform(log(low), log(high))))
+
+        mode, damping, delay = between(60.0, 600.0), between(0.005, 0.5), between(2e-4, 5e-3)
+        character = Character(
+            delay=delay, resonance=mode, damping=min(damping, 0.499), creep=float(rng.uniform(0.005, 0.02)),
+            thermal_drift=float(rng.uniform(-0.3e-6, 0.3e-6)), drift_time=float(rng.uniform(3.0, 30.0)),
+        )  # fmt: skip
+        rate = between(6.0 * mode, 5000.0)
+        return cls(AxisParameters.random(int(rng.integers(2**31))), character, rate, seed)
+
+    def identified(self) -> AxisModel:
+        """Return the model of a calibration and of a drive for the mode, as diagnosed."""
+        records = []
+        for number, (drive, share) in enumerate((("calibration", 0.65), ("resonance", 0.35))):
+            slew = 0.0 if drive == "resonance" else 1000.0
+            voltages = excite(
+                voltage_min=0.0, voltage_max=100.0, slew_limit=slew, rate=self.rate,
+                duration=share * SAMPLES / self.rate, seed=self.seed, drive=drive,
+            )  # fmt: skip
+            v = voltages.voltage["x"]
+            _, y = SimulatedAxis(self.parameters, number, self.character).run(voltages.t, v)
+            stamps = (voltages.t * SECOND_NS).astype(np.int64) + number * 10**12
+            records.append(Record(stamps, {"x": v}, {"x": y}, f"record {number}"))
+        return diagnose(records, identify(records[0])).extended.axis("x")
+
+    def closed(
+        self,
+        model: AxisModel,
+        gains: PidGains,
+        seconds: float,
+        path: Signal,
+        added: np.ndarray,
+        noise: bool,
+        scale: float,
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Return true displacement and reading (m), (N,) each, at the readings; `added` (m, (M,)) repeats on these."""
+        quiet = self.parameters if noise else replace(self.parameters, noise_rms=0.0, quantisation=0.0)
+        axis = SimulatedAxis(quiet, self.seed, replace(self.character, resonance=self.character.resonance * scale))
+        period_ns = round(SECOND_NS / self.rate)
+        feedback = gains.integral > 0.0
+        loop = LoopSettings(feedback, gains, 0.3, 50.0, True)
+        made = Controller(["x"], [LIMITS], loops=[loop], period=period_ns * 1e-9)
+        made.use_model(StageModel({"x": model}))
+        made.activate(BEGIN_NS)
+        v = made.axes[0].output.voltage
+        begin_ns = BEGIN_NS // period_ns * period_ns + 10 * period_ns
+        true, readings = [], []
+
+        def moved(at_ns: int) -> float:
+            return axis.step((at_ns - begin_ns) * 1e-9 + 1.0, v)
+
+        for k in range(round(seconds * self.rate)):
+            now_ns = begin_ns + k * period_ns
+            t = k * period_ns * 1e-9
+            # The correction from the last reading, with the next setpoint; then a reading of the stage.
+            made.update(now_ns, ["x"], [path(t)], now_ns)
+            if made.axes[0].output.voltage != v:
+                moved(now_ns)
+                v = made.axes[0].output.voltage
+                moved(now_ns)
+            at_ns = now_ns + period_ns // 50
+            x = moved(at_ns)
+            y = (axis.measure(x) if noise else x) + (float(added[k % added.size]) if added.size else 0.0)
+            with suppress(RejectedError):
+                made.measure(["x"], [y], at_ns)
+            true.append(x)
+            readings.append(y)
+        return np.array(true), np.array(readings)
+
+
+def multisine(size: int, rms: float, rng: np.random.Generator) -> np.ndarray:
+    """Return a period of a signal (m, (size,)) of an rms (m), of all frequencies; octaves below a tenth are alike."""
+    k = np.arange(size // 2 + 1)
+    spectrum = np.exp(2j * pi * rng.random(k.size)) / np.sqrt(np.minimum(np.maximum(k, 1), size // 20))
+    spectrum[0] = 0.0
+    signal = np.fft.irfft(spectrum, size)
+    return np.asarray(signal * rms / signal.std())
+
+
+def sensitivity(stage: Stage, model: AxisModel, gains: PidGains, middle: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return frequencies (Hz) and sensitivity, complex, (K,) each, of the loop on the stage at rest."""
+    size, periods = int(2.0 * stage.rate), 3
+    added = multisine(size, MULTISINE * float(np.ptp(model.displacement_range)), np.random.default_rng(stage.seed))
+    _, y = stage.closed(model, gains, periods * size / stage.rate, lambda t: middle, added, False, 1.0)
+    last = y[-size:] - y[-size:].mean()
+    begin = (y.size - size) % size
+    return np.arange(1, size // 2) * stage.rate / size, (
+        np.fft.rfft(last)[1 : size // 2] / np.fft.rfft(np.roll(added, -begin))[1 : size // 2]
+    )
+
+
+def judged(seed: int) -> dict[str, float]:
+    """Return the figures of one stage."""
+    stage, begun = Stage.drawn(seed), time.process_time()
+    model = stage.identified()
+    known, tuned = time.process_time(), design(model, stage.rate)
+    made = time.process_time()
+    low, high = model.displacement_range
+    middle, stroke = 0.5 * (low + high), high - low
+    f, s = sensitivity(stage, model, tuned.gains, middle)
+    size = np.abs(s)
+    reached = np.flatnonzero(size >= HALF)
+    bandwidth = float(f[reached[0]])
+    # The slope that the stage has shown: of the return ratio where it is large.
+    linear = DiscreteLoop(tuned.plant, tuned.gains, 1.0 / stage.rate)
+    slow = (f > 0.1 * bandwidth) & (f < 0.5 * bandwidth)
+    back = 1.0 / s[slow] - 1.0
+    slope = tuned.plant.slope * float(np.median(np.abs(back) / np.abs(linear.response(2.0 * pi * f[slow]))))
+    character = stage.character
+    w = 2.0 * pi * character.resonance
+    rule = min(2.0 * character.damping * w / 5.0, 0.2 / character.delay)
+    effects = (Delay(character.delay), Resonance((Mode(character.resonance, character.damping, 1.0),)))
+    loop = Loop.of(replace(model, effects=effects), 1.0 / stage.rate)
+    loop = replace(loop, nominal=replace(loop.nominal, slope=slope), corners=())
+    g = stroke / (model.voltage_range[1] - model.voltage_range[0])
+    today = loop.bandwidth(Shape(0.0, 0.0, ()), rule / g)
+    share, raster, seconds = RASTER
+    none = np.empty(0)
+
+    def path(t: float) -> float:
+        # From rest to the middle first; then a triangle.
+        wave = 4.0 * abs((t * raster + 0.25) % 1.0 - 0.5) - 1.0
+        return middle * min(t / 0.5, 1.0) - (0.5 * share * stroke * wave if t >= 0.5 else 0.0) * min(
+            max(t - 0.5, 0.0) * 5.0, 1.0
+        )
+
+    errors = []
+    for gains in (PidGains(0.0), PidGains(0.0, rule / g), tuned.gains):
+        x, _ = stage.closed(model, gains, 1.0 + seconds, path, none, True, 1.0)
+        t = np.arange(x.size) / stage.rate
+        error = x - np.array([path(each) for each in t])
+        errors.append(float(np.sqrt(np.mean(error[t >= 1.0] ** 2))))
+    stable = 0
+    added = multisine(int(0.5 * stage.rate), MULTISINE * stroke, np.random.default_rng(1))
+    for scale in (0.9, 1.1):
+        _, y = stage.closed(model, tuned.gains, 2.0, lambda t: middle, added, False, scale)
+        parts = [float(np.ptp(part)) for part in np.array_split(y[y.size // 4 :], 3)]
+        stable += parts[2] < 2.0 * parts[0] and parts[2] < 10.0 * np.ptp(added)
+    return {
+        "mode": character.resonance, "damping": character.damping, "delay": character.delay, "rate": stage.rate,
+        "bandwidth": bandwidth, "predicted": tuned.bandwidth, "ratio": bandwidth / today,
+        "margin": float(1.0 / size.max()), "stable": stable,
+        "feedforward": errors[0], "rule": errors[1], "tuned": errors[2],
+        "seconds": made - known, "identified": known - begun,
+    }  # fmt: skip
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Print each stage and the counts."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--count", type=int, default=30)
+    parser.add_argument("--first", type=int, default=0, help="first seed")
+    options = parser.parse_args(arguments)
+    print(
+        " seed  mode/Hz damping delay/ms rate/Hz | bandwidth/Hz (predicted) over today's rule, margin, stable of 2 | "
+        "raster, nm rms: feedforward, today's rule, tuned", flush=True,
+    )  # fmt: skip
+    found = []
+    for seed in range(options.first, options.first + options.count):
+        one = judged(seed)
+        found.append(one)
+        print(
+            f"{seed:5d} {one['mode']:8.0f} {one['damping']:7.3f} {one['delay'] * 1e3:8.2f} {one['rate']:7.0f} | "
+            f"{one['bandwidth']:6.1f} ({one['predicted']:.1f}) {one['ratio']:6.1f} "
+            f"{one['margin']:5.2f} {one['stable']} | "
+            f"{one['feedforward'] * 1e9:7.1f} {one['rule'] * 1e9:7.1f} {one['tuned'] * 1e9:7.1f} "
+            f"| {one['identified']:.0f} + {one['seconds']:.1f} s", flush=True,
+        )  # fmt: skip
+    ratio, margin, stable = (np.array([one[name] for one in found]) for name in ("ratio", "margin", "stable"))
+    forward, rule, tuned = (np.array([one[name] for one in found]) for name in ("feedforward", "rule", "tuned"))
+    n, less = len(found), np.sum(ratio >= 2.5)
+    print(
+        f"bandwidth over today's rule: median {np.median(ratio):.1f}, 2.5 or more {less}, below 1 {np.sum(ratio < 1)}"
+    )
+    print(f"modulus margin 0.45 or more: {np.sum(margin >= 0.45)} of {n}")
+    print(f"stable with the mode 10 % off: {np.sum(stable == 2)} of {n}")
+    print(f"raster: at most half of feedforward {np.sum(tuned <= 0.5 * forward)} of {n}")
+    print(f"raster: above 1.2 times today's rule {np.sum(tuned > 1.2 * rule)} of {n}")
+    return 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())

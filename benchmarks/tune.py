@@ -37,8 +37,9 @@ from slpi_ros.simulation.parameters import AxisParameters
 
 BEGIN_NS, SECOND_NS = 10**12, 10**9
 LIMITS = Limits(0.0, 100.0)
-# Samples of the records; rms of the multisine and size of the raster (shares of the stroke), its frequency (Hz), s.
-SAMPLES, MULTISINE, RASTER = 14_000, 0.01, (0.3, 5.0, 2.0)
+# Samples of the records, and least time (s); rms of the multisine, and size of the raster (shares of the stroke), with
+# its frequency (Hz), and seconds.
+SAMPLES, SHORTEST, MULTISINE, RASTER = 14_000, 3.0, 0.01, (0.3, 5.0, 2.0)
 Signal = Callable[[float], float]
 
 
@@ -74,7 +75,7 @@ class Stage:
             slew = 0.0 if drive == "resonance" else 1000.0
             voltages = excite(
                 voltage_min=0.0, voltage_max=100.0, slew_limit=slew, rate=self.rate,
-                duration=share * SAMPLES / self.rate, seed=self.seed, drive=drive,
+                duration=max(share * SAMPLES / self.rate, SHORTEST), seed=self.seed, drive=drive,
             )  # fmt: skip
             v = voltages.voltage["x"]
             _, y = SimulatedAxis(self.parameters, number, self.character).run(voltages.t, v)

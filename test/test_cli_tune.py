@@ -12,6 +12,7 @@ from strategies import PI_CASE, axis_model
 import slpi_ros
 from slpi_ros.cli import main
 from slpi_ros.compensator.gains_file import TunedGains
+from slpi_ros.compensator.loop_margin import DiscreteLoop, Plant
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.filters import Mode
 from slpi_ros.effects.resonance import Resonance
@@ -94,3 +95,51 @@ def test_a_file_by_somebody_else_and_the_model_stay(folder, tmp_path, capsys):
         before = output.read_bytes()
         assert main(["tune", str(folder / "xy.json"), "-o", str(output)]) == 2
         assert str(output) in capsys.readouterr().err and output.read_bytes() == before
+
+
+def test_a_measured_response_is_shown_beside_the_model_and_used(folder, tmp_path, capsys):
+    """From the drive to the page: a stage whose mode is elsewhere than the model says."""
+    from slpi_ros.io.bag_writer import write_bag
+    from slpi_ros.io.record import Record
+    from slpi_ros.io.tables import read_table
+    from slpi_ros.simulation.axis import SimulatedAxis
+    from slpi_ros.simulation.character import Character
+    from slpi_ros.simulation.parameters import AxisParameters
+
+    drive = tmp_path / "drive.csv"
+    limits = ("--voltage-min", "0", "--voltage-max", "100", "--rate", "1000", "--duration", "20")
+    assert main(["excite", "-o", str(drive), "--for-response", *limits]) == 0
+    assert main(["excite", "-o", str(drive), "--for-response", "--for", "creep", *limits]) == 2
+    t, voltage = read_table(str(drive), "V")
+    stage = SimulatedAxis(AxisParameters.random(4), 1, Character(delay=1e-3, resonance=100.0, damping=0.02))
+    _, y = stage.run(t, voltage["x"])
+    write_bag(tmp_path / "bag", Record((t * 1e9).astype(int), {"x": voltage["x"]}, {"x": y}, "bag"))
+    arguments = [
+        folder / "xy.json",
+        tmp_path / "bag",
+        "-o",
+        tmp_path / "g.yaml",
+        "--axis",
+        "x",
+        "--report",
+        tmp_path / "r",
+    ]
+    capsys.readouterr()
+    assert main([str(each) for each in ("tune", *arguments, "--rate", "1500")]) == 0
+    said = capsys.readouterr().out
+    band = said.split("agree from ")[1].split(" Hz")[0].split(" to ")
+    assert float(band[0]) < 2.0 and 20.0 < float(band[1]) < 110.0
+    page = parsed(tmp_path / "r" / "report.html")
+    frequency, response = trace(page.charts["bode-x"], "measured")
+    assert frequency[response.argmax()] == pytest.approx(100.0, rel=0.05)
+    # The mode that was measured is one of those the loop bears.
+    true = Plant.of(replace(X, effects=(Delay(1e-3), Resonance((Mode(100.0, 0.02, 1.0),)))))
+    before, after = (
+        DiscreteLoop(true, TunedGains.read(str(path)).axes["x"], 1.0 / 1500.0).margins.modulus
+        for path in (folder / "gains.yaml", tmp_path / "g.yaml")
+    )
+    assert before < 0.3 and after > 0.4
+    # A record of something else is refused, and so is one bag too many.
+    write_bag(tmp_path / "other", Record((t * 1e9).astype(int), {"x": 50.0 + 0.0 * t}, {"x": y}, "other"))
+    assert main(["tune", str(folder / "xy.json"), str(tmp_path / "other"), "-o", str(tmp_path / "g.yaml")]) == 1
+    assert "--for-response" in capsys.readouterr().err

@@ -5,14 +5,18 @@ from contextlib import nullcontext
 
 from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Command, Result, command_line
-from slpi_ros.errors import UsageError
 
 RATE, MARGIN = 1000.0, 0.5
 
 
 def _add_options(command: ArgumentParser) -> None:
     command.add_argument("model", metavar="MODEL.json", help="model of the stage")
+    command.add_argument(
+        "bags", metavar="BAG", nargs="?", help="record of a drive by slpi excite --for-response; default: none"
+    )
     common.add_output(command, "GAINS.yaml", "parameters of the compensator to write")
+    common.add_topic(command)
+    common.add_accept_stage(command)
     common.add_axes(command, help="axes to tune; the others get no feedback; default: all")
     command.add_argument(
         "--rate", metavar="HZ", type=float, default=RATE,
@@ -28,36 +32,32 @@ def _add_options(command: ArgumentParser) -> None:
 def _run(options: Namespace) -> Result:
     from slpi_ros.compensator.feedback import PidGains
     from slpi_ros.compensator.gains_file import TunedGains
-    from slpi_ros.compensator.loop_design import design
-    from slpi_ros.errors import SlpiError
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.io.outputs import allow_gains
     from slpi_ros.model.document import load_model
-    from slpi_ros.reports.tuning import FILES, describe, tuning_document, write_files
+    from slpi_ros.reports.tuning import FILES, describe, describe_measured, tuning_document, write_files
+    from slpi_ros.workflows.tune import TuneRequest, tune
 
-    common.require_another_file(options.output, options.model)
+    options.bags = [options.bags] if options.bags else []
+    common.require_another_file(options.output, options.model, *options.bags)
     model = load_model(options.model)
     options.remarks += allow_gains(options.output, overwrite=options.overwrite)
-    names = options.axis or list(model.axes)
-    for name in names:
-        if name not in model.axes:
-            raise UsageError(f"--axis {name}: the model has axes {', '.join(model.axes)}; name one of these")
     if options.report:
-        options.bags = []
         common.allow_folder(options, options.report, *FILES, inputs=[options.model, options.output])
-    found = {}
-    for name in names:
-        try:
-            found[name] = design(model.axes[name], options.rate, options.margin)
-        except SlpiError as error:
-            raise type(error)(f"axis '{name}': {error}") from None
+    source = common.source_of(options) if options.bags else None
+    done = tune(TuneRequest(model, options.rate, options.margin, options.axis or (), source))
+    found = done.designs
     with output_folder(options.report, *FILES) if options.report else nullcontext() as folder:
         gains = {name: found[name].gains if name in found else PidGains(0.0) for name in model.axes}
         stage = f" for stage {model.hardware_id}" if model.hardware_id else ""
         TunedGains(options.rate, gains).write(options.output, stage)
         if folder:
-            write_files(folder, model, found)
-    lines = [f"axis {name}: {line}" for name, one in found.items() for line in describe(model.axes[name], one)]
+            write_files(folder, model, found, done.responses)
+    lines = [
+        f"axis {name}: {line}"
+        for name, one in found.items()
+        for line in (*describe(model.axes[name], one), *describe_measured(one, done.responses.get(name)))
+    ]
     axes = {name: tuning_document(model.axes[name], one) for name, one in found.items()}
     node = ("ros2", "run", "slpi_ros", "compensator", "--ros-args", "--params-file", "STAGE.yaml")
     return Result(

@@ -52,9 +52,12 @@ class Loop:
     corners: tuple[Plant, ...]
     modes: tuple[Mode, ...]
     period: float
+    # What was measured over what the model says, at rising frequencies (rad/s), (M,) each, 1 at the lowest: one more
+    # corner.
+    measured: tuple[FloatArray, ComplexArray] | None = None
 
     @classmethod
-    def of(cls, model: AxisModel, period: float) -> "Loop":
+    def of(cls, model: AxisModel, period: float, measured: tuple[FloatArray, ComplexArray] | None = None) -> "Loop":
         """Return the loop of a model; ModelError if it has no slope, UsageError for a mode above half the rate."""
         if not model.causal:
             raise ModelError(f"kind {model.kind} needs the path in advance, feedback does not; identify another kind")
@@ -68,7 +71,7 @@ class Loop:
                     f"the mode at {mode.frequency:.4g} Hz is above half the loop's rate of {1.0 / period:.4g} Hz; give "
                     "a higher --rate, of sensor and output"
                 )
-        return cls(nominal, tuple(_corners(model, nominal)), modes, period)
+        return cls(nominal, tuple(_corners(model, nominal)), modes, period, measured)
 
     @cached_property
     def hardest(self) -> "Loop":
@@ -91,7 +94,13 @@ class Loop:
     def delayed(self) -> ComplexArray:
         """Return ratios of nominal plant and corners for a controller of 1 V/m, shape (1 + K, N)."""
         plants = (self.nominal, *self.corners)
-        return np.array([DiscreteLoop(each, PidGains(1.0), self.period).response(self.omega) for each in plants])
+        rows = [DiscreteLoop(each, PidGains(1.0), self.period).response(self.omega) for each in plants]
+        if self.measured:
+            omega, ratio = self.measured
+            size = np.interp(self.omega, omega, np.log(np.abs(ratio)), left=0.0, right=0.0)
+            angle = np.interp(self.omega, omega, np.unwrap(np.angle(ratio)), left=0.0, right=0.0)
+            rows.append(rows[0] * (1.0 + STEEPER) * np.exp(size + 1j * angle))
+        return np.array(rows)
 
     @cached_property
     def z(self) -> ComplexArray:
@@ -189,7 +198,12 @@ class Design:
         return float(t[outside[-1] + 1]) if outside[-1] + 1 < t.size else inf
 
 
-def design(model: AxisModel, rate: float, margin: float = MARGIN) -> Design:
+def design(
+    model: AxisModel,
+    rate: float,
+    margin: float = MARGIN,
+    measured: tuple[FloatArray, ComplexArray] | None = None,
+) -> Design:
     """Return the loop of the largest bandwidth for a model of an axis.
 
     Parameters
@@ -200,6 +214,9 @@ def design(model: AxisModel, rate: float, margin: float = MARGIN) -> Design:
     margin : float
         Modulus margin, ``min |1 + L|``, that is kept with each mode off by `DETUNING`, a steeper slope, later messages
         and less damping, as far as the model is uncertain of it.
+    measured : (ndarray, ndarray), shape (M,) each, optional
+        Frequencies, rad/s, and the measured response there over that of the model, 1 at the lowest: with it the margin
+        is kept, too.
 
     Returns
     -------
@@ -216,7 +233,7 @@ def design(model: AxisModel, rate: float, margin: float = MARGIN) -> Design:
         raise UsageError(f"a margin of {margin:g}; give a number from {MARGINS[0]:g} to {MARGINS[1]:g}, as {MARGIN:g}")
     if not (isfinite(rate) and 1.0 <= rate <= 20_000.0):
         raise UsageError(f"a rate of {rate:g} Hz; give what output_rate takes, 1 to 20000 Hz")
-    loop = Loop.of(model, 1.0 / rate)
+    loop = Loop.of(model, 1.0 / rate, measured)
     shape = _quieter(loop, _best(loop, margin), margin)
     gains = shape.gains(loop.largest(shape, margin))
     if not gains.integral > 0.0:

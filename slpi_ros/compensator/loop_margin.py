@@ -49,6 +49,13 @@ class Plant:
         slope = _steepest(model) * float(np.prod([effect.steepest for effect in chain.own]))
         return cls(slope, max(chain.delay, 0.0) + sensor.delay, dynamics)
 
+    def response(self, omega: FloatArray) -> ComplexArray:
+        """Return the frequency response, m/V, shape (N,), at `omega` (rad/s) of the plant itself, without a hold."""
+        a, b, c, d = self.dynamics
+        states = 1j * omega[:, None, None] * np.eye(len(b)) - a
+        driven = np.linalg.solve(states, np.broadcast_to(b[:, None], (omega.size, len(b), 1)))[..., 0]
+        return np.asarray(self.slope * (driven @ c + d) * np.exp(-1j * omega * self.delay))
+
 
 @dataclass(frozen=True)
 class Margins:

@@ -7,11 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from slpi_ros.arrays import FloatArray
-from slpi_ros.compensator.feedback import PidGains
 from slpi_ros.compensator.loop_design import DETUNING, HALF, NOISES, SETTLED, STEP, Design, Loop
-from slpi_ros.compensator.loop_margin import ComplexArray, DiscreteLoop
+from slpi_ros.compensator.loop_margin import DiscreteLoop
 from slpi_ros.errors import length
+from slpi_ros.identification.frequency_response import FrequencyResponse
 from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports.chart import AFTER, DESIRED, MEASURED, NOISE, TIME, Chart, Panel, Quantity
@@ -47,6 +46,21 @@ def describe(axis: AxisModel, found: Design) -> list[str]:
         f"within the noise after {_time(_settling(axis, found)[1])}",
         f"the sensor's noise of {length(axis.quality.floor_rms)} moves the stage by {length(found.noise)} rms",
         *limits(axis, found),
+    ]
+
+
+def describe_measured(found: Design, measured: FrequencyResponse | None) -> list[str]:
+    """Return where a measured response and the model agree, as lines of text."""
+    if measured is None:
+        return []
+    model = found.plant.response(2.0 * pi * measured.frequency)
+    band = measured.agreement(model)
+    where = f"agree from {band[0]:.3g} to {band[1]:.4g} Hz" if band else "agree nowhere"
+    low = slice(0, max(3, measured.frequency.size // 20))
+    slope = float(np.median(np.abs(measured.response[low])))
+    return [
+        f"measured and modelled response {where}, but for the slope: {slope * 1e9:.3g} nm/V of small motions, "
+        f"{found.plant.slope * 1e9:.3g} nm/V at the steepest; in the design both are used"
     ]
 
 
@@ -101,7 +115,9 @@ def tuning_document(axis: AxisModel, found: Design) -> dict[str, Any]:
     }
 
 
-def write_files(folder: Path, model: StageModel, found: Mapping[str, Design]) -> None:
+def write_files(
+    folder: Path, model: StageModel, found: Mapping[str, Design], measured: Mapping[str, FrequencyResponse]
+) -> None:
     """Write the page into a folder."""
     page = Page("The closed loop" + (f" of stage {model.hardware_id}" if model.hardware_id else ""))
     page.contents(tuple(found))
@@ -120,12 +136,23 @@ def write_files(folder: Path, model: StageModel, found: Mapping[str, Design]) ->
                 "noise at the stage": length(one.noise),
             }
         )
-        page.lines(describe(axis, one))
-        _show(page, name, axis, one)
+        page.lines([*describe(axis, one), *describe_measured(one, measured.get(name))])
+        _show(page, name, axis, one, measured.get(name))
     page.write(folder / FILES[0])
 
 
-def _show(page: Page, name: str, axis: AxisModel, found: Design) -> None:
+def _show_measured(bode: Chart, measured: FrequencyResponse) -> None:
+    """Add what was measured, with its interval of 95 %."""
+    size, half = np.abs(measured.response), measured.interval
+    bode.line(0, "95 % interval", measured.frequency, size + half, NOISE, width=1.0)
+    bode.line(0, "95 % interval", measured.frequency, np.maximum(size - half, 0.01 * size), NOISE, width=1.0)
+    sure = measured.relative < 1.0
+    bode.dots(0, "measured", measured.frequency[sure], size[sure], AFTER)
+    angle = np.unwrap(np.angle(measured.response[sure]))
+    bode.dots(1, "measured", measured.frequency[sure], angle, AFTER)
+
+
+def _show(page: Page, name: str, axis: AxisModel, found: Design, measured: FrequencyResponse | None) -> None:
     loop = Loop.of(axis, found.period)
     frequency = np.geomspace(max(1e-2 * found.bandwidth, 1e-6), 0.5 / found.period, POINTS)
     frequency = np.unique(np.concatenate([frequency, loop.omega[loop.omega > 2.0 * pi * frequency[0]] / (2.0 * pi)]))
@@ -136,16 +163,19 @@ def _show(page: Page, name: str, axis: AxisModel, found: Design) -> None:
         *((corner, f"the mode {DETUNING:.0%} off", MEASURED, 1.0) for corner in corners),
         (loop.nominal, "model", DESIRED, 1.6),
     ):
-        response = _stage(DiscreteLoop(each, PidGains(1.0), found.period), omega)
+        response = each.response(omega)
         bode.line(0, label, frequency, np.abs(response), colour, width=width)
         if each is loop.nominal:
             bode.line(1, label, frequency, np.unwrap(np.angle(response)), colour, width=width)
+    if measured:
+        _show_measured(bode, measured)
     page.section("What the stage does: a small sine of the voltage, seen by the sensor")
     page.chart(
         f"bode-{name}", bode,
         "How many nanometres the reading moves for each volt, and by how much it is late (360 degrees: a whole "
         "period). A peak is a mode: there the stage rings, and the notch takes the feedback out. Grey: that mode 10 % "
-        "lower and higher, with which the loop keeps its margin, too.",
+        "lower and higher, with which the loop keeps its margin, too. Dots are measured; the model's slope is that "
+        "of the steepest part of a large loop, and a small motion has less.",
     )  # fmt: skip
     sensitivity = Chart([Panel(FREQUENCY, SENSITIVITY)], "column", 380)
     for each, label, colour, width in (
@@ -173,8 +203,3 @@ def _show(page: Page, name: str, axis: AxisModel, found: Design) -> None:
     step.line(0, "1 %", t[[0, -1]], np.full(2, -SETTLED), NOISE, width=1.2)
     page.section("A step, by feedback alone")
     page.chart(f"step-{name}", step, "The model's feedforward does most of a real step; feedback removes the rest so.")
-
-
-def _stage(loop: DiscreteLoop, omega: FloatArray) -> ComplexArray:
-    """Return what a sine of the voltage does to the reading (m/V), shape (N,), without the period of the loop."""
-    return np.asarray(loop.response(omega) * np.exp(1j * omega * loop.period))

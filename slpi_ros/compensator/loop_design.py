@@ -11,7 +11,7 @@ import numpy as np
 from slpi_ros.arrays import FloatArray
 from slpi_ros.compensator.feedback import PidGains
 from slpi_ros.compensator.loop_filter import LoopFilter, Notch, response, sections
-from slpi_ros.compensator.loop_margin import BESIDE, ComplexArray, DiscreteLoop, Plant
+from slpi_ros.compensator.loop_margin import BESIDE, LEAST_MARGIN, ComplexArray, DiscreteLoop, Plant
 from slpi_ros.effects.filters import Mode
 from slpi_ros.errors import ModelError, UsageError
 from slpi_ros.model.axis_model import AxisModel
@@ -20,7 +20,7 @@ from slpi_ros.model.axis_model import AxisModel
 MARGIN, MARGINS, DETUNING = 0.5, (0.3, 0.9), 0.1
 # Delay of the two messages of a correction that no record holds, s, from none to this.
 MESSAGES = 3e-4
-# The margin is kept where the slope is larger by this share than the steepest of the model.
+# The margin is kept where the slope is larger by this share than that of the largest loop.
 STEEPER = 0.05
 # So many standard uncertainties less damping.
 UNCERTAIN = 2.0
@@ -52,6 +52,7 @@ class Loop:
     corners: tuple[Plant, ...]
     modes: tuple[Mode, ...]
     period: float
+    steep: float = 1.0  # steepest slope over that of the nominal plant
     # What was measured over what the model says, at rising frequencies (rad/s), (M,) each, 1 at the lowest: one more
     # corner.
     measured: tuple[FloatArray, ComplexArray] | None = None
@@ -61,7 +62,8 @@ class Loop:
         """Return the loop of a model; ModelError if it has no slope, UsageError for a mode above half the rate."""
         if not model.causal:
             raise ModelError(f"kind {model.kind} needs the path in advance, feedback does not; identify another kind")
-        nominal = Plant.of(model)
+        steepest = Plant.of(model)
+        nominal = replace(steepest, slope=_mean_slope(model, steepest.slope))
         if not (isfinite(nominal.slope) and nominal.slope > 0.0):
             raise ModelError(f"the model has a slope of {nominal.slope:g} m/V; identify it from a record that moves")
         modes = tuple(mode for effect in model.effects for mode in effect.ringing)
@@ -71,7 +73,8 @@ class Loop:
                     f"the mode at {mode.frequency:.4g} Hz is above half the loop's rate of {1.0 / period:.4g} Hz; give "
                     "a higher --rate, of sensor and output"
                 )
-        return cls(nominal, tuple(_corners(model, nominal)), modes, period, measured)
+        steep = steepest.slope / nominal.slope
+        return cls(nominal, tuple(_corners(model, nominal)), modes, period, steep, measured)
 
     @cached_property
     def hardest(self) -> "Loop":
@@ -114,14 +117,14 @@ class Loop:
         return pi_part * response(sections(shape.notches, shape.low_pass, self.period), z)
 
     def largest(self, shape: "Shape", margin: float) -> float:
-        """Return the largest integral gain up to which every smaller one keeps the margin at all corners, V/(m s)."""
+        """Return the largest integral gain up to which every smaller one keeps the margins at all corners, V/(m s).
+
+        `margin` is kept at the slope of the largest loop, `LEAST_MARGIN` at the steepest slope.
+        """
         back = self.delayed * self.controller(shape)
         size = back.real**2 + back.imag**2
-        inside = back.real**2 - size * (1.0 - margin**2)
-        meets = (back.real < 0.0) & (inside > 0.0)
-        if not meets.any():
-            return 0.0
-        return float(np.min((-back.real[meets] - np.sqrt(inside[meets])) / size[meets]))
+        allowed = _smallest(back, size, margin), _smallest(back, size, LEAST_MARGIN) / self.steep
+        return min(allowed) if min(allowed) < inf else 0.0
 
     def bandwidth(self, shape: "Shape", integral: float) -> float:
         """Return the lowest frequency (Hz) at which the sensitivity of the nominal loop reaches -3 dB."""
@@ -212,8 +215,9 @@ def design(
     rate : float, hertz
         Corrections per second, and readings.
     margin : float
-        Modulus margin, ``min |1 + L|``, that is kept with each mode off by `DETUNING`, a steeper slope, later messages
-        and less damping, as far as the model is uncertain of it.
+        Modulus margin, ``min |1 + L|``, that is kept at the slope of the largest loop from end to end with each mode
+        off by `DETUNING`, later messages and less damping, as far as the model is uncertain of it; where the loop is
+        steepest `LEAST_MARGIN` is.
     measured : (ndarray, ndarray), shape (M,) each, optional
         Frequencies, rad/s, and the measured response there over that of the model, 1 at the lowest: with it the margin
         is kept, too.
@@ -252,6 +256,21 @@ def design(
         model.quality.floor_rms * _noise_gain(loop, back[0]),
         dict(sorted(kept.items(), key=lambda item: -item[1])),
     )
+
+
+def _smallest(back: ComplexArray, size: FloatArray, margin: float) -> float:
+    """Return the smallest gain at which a return ratio, with the square of its size, is as near to -1 as the margin."""
+    inside = back.real**2 - size * (1.0 - margin**2)
+    meets = (back.real < 0.0) & (inside > 0.0)
+    if not meets.any():
+        return inf
+    return float(np.min((-back.real[meets] - np.sqrt(inside[meets])) / size[meets]))
+
+
+def _mean_slope(model: AxisModel, steepest: float) -> float:
+    """Return the slope (m/V) of the largest loop from end to end."""
+    (low, high), (first, last) = model.displacement_range, model.hysteresis_range
+    return min((high - low) / (last - first), steepest) if last > first else steepest
 
 
 def _corners(model: AxisModel, nominal: Plant) -> Iterator[Plant]:

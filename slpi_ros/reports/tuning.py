@@ -60,7 +60,7 @@ def describe_measured(found: Design, measured: FrequencyResponse | None) -> list
     slope = float(np.median(np.abs(measured.response[low])))
     return [
         f"measured and modelled response {where}, but for the slope: {slope * 1e9:.3g} nm/V of small motions, "
-        f"{found.plant.slope * 1e9:.3g} nm/V at the steepest; in the design both are used"
+        f"{found.plant.slope * 1e9:.3g} nm/V of the largest loop; in the design both are used"
     ]
 
 
@@ -175,7 +175,7 @@ def _show(page: Page, name: str, axis: AxisModel, found: Design, measured: Frequ
         "How many nanometres the reading moves for each volt, and by how much it is late (360 degrees: a whole "
         "period). A peak is a mode: there the stage rings, and the notch takes the feedback out. Grey: that mode 10 % "
         "lower and higher, with which the loop keeps its margin, too. Dots are measured; the model's slope is that "
-        "of the steepest part of a large loop, and a small motion has less.",
+        "of the largest loop, and a small motion has less.",
     )  # fmt: skip
     sensitivity = Chart([Panel(FREQUENCY, SENSITIVITY)], "column", 380)
     for each, label, colour, width in (

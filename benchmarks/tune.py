@@ -1,10 +1,10 @@
 """Loops tuned without a hand on simulated stages of other physics: bandwidth, margin, detuned modes, a raster.
 
 Each stage (Preisach hysteresis, a mode of 60 to 600 Hz with a damping of 0.005 to 0.5, 0.2 to 5 ms of delay, sensor and
-loop at six times the mode to 5 kHz) is identified and diagnosed from two records, `slpi_ros.compensator.loop_design`
-makes the gains, and the compensator's controller closes the loop on the stage. Sensitivity is measured with a multisine
-on the reading. Today's rule is ``ki g = min(2 d w / 5, 0.2 / delay)`` with the true numbers; its bandwidth is that of
-the linear loop with the slope that the tuned loop has shown.
+loop at six times the mode to 5 kHz) is identified and diagnosed from two records, its frequency response measured in a
+third, `slpi_ros.compensator.loop_design` makes the gains, and the compensator's controller closes the loop on the
+stage. Sensitivity is measured with a multisine on the reading. Today's rule is ``ki g = min(2 d w / 5, 0.2 / delay)``
+with the true numbers; its bandwidth is that of the linear loop with the slope that the tuned loop has shown.
 """
 
 import argparse
@@ -26,7 +26,9 @@ from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.filters import Mode
 from slpi_ros.effects.resonance import Resonance
 from slpi_ros.excitation.drives import excite
+from slpi_ros.excitation.response import response_drive
 from slpi_ros.identification.fit import identify
+from slpi_ros.identification.frequency_response import FrequencyResponse, frequency_response
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.limits import Limits
@@ -34,11 +36,13 @@ from slpi_ros.model.stage_model import StageModel
 from slpi_ros.simulation.axis import SimulatedAxis
 from slpi_ros.simulation.character import Character
 from slpi_ros.simulation.parameters import AxisParameters
+from slpi_ros.workflows.tune import beside_model
 
 BEGIN_NS, SECOND_NS = 10**12, 10**9
 LIMITS = Limits(0.0, 100.0)
 # Samples of the records, and least time (s); rms of the multisine, and size of the raster (shares of the stroke), with
-# its frequency (Hz), and seconds.
+# its frequency (Hz), and seconds. Time of the record of the response (s).
+RESPONSE = 12.0
 SAMPLES, SHORTEST, MULTISINE, RASTER = 14_000, 3.0, 0.01, (0.3, 5.0, 2.0)
 Signal = Callable[[float], float]
 
@@ -67,6 +71,12 @@ class Stage:
         )  # fmt: skip
         rate = between(6.0 * mode, 5000.0)
         return cls(AxisParameters.random(int(rng.integers(2**31))), character, rate, seed)
+
+    def measured(self) -> FrequencyResponse:
+        """Return the frequency response, of the drive for it."""
+        drive = response_drive(("x",), 0.0, 100.0, 800.0, RESPONSE, self.rate, self.seed)
+        _, y = SimulatedAxis(self.parameters, 2, self.character).run(drive.t, drive.voltage["x"])
+        return frequency_response(drive.t, drive.voltage["x"], y)
 
     def identified(self) -> AxisModel:
         """Return the model of a calibration and of a drive for the mode, as diagnosed."""
@@ -153,7 +163,8 @@ def judged(seed: int) -> dict[str, float]:
     """Return the figures of one stage."""
     stage, begun = Stage.drawn(seed), time.process_time()
     model = stage.identified()
-    known, tuned = time.process_time(), design(model, stage.rate)
+    response, known = stage.measured(), time.process_time()
+    tuned = design(model, stage.rate, measured=beside_model(model, response))
     made = time.process_time()
     low, high = model.displacement_range
     middle, stroke = 0.5 * (low + high), high - low
@@ -163,7 +174,7 @@ def judged(seed: int) -> dict[str, float]:
     bandwidth = float(f[reached[0]])
     # The slope that the stage has shown: of the return ratio where it is large.
     linear = DiscreteLoop(tuned.plant, tuned.gains, 1.0 / stage.rate)
-    slow = (f > 0.1 * bandwidth) & (f < 0.5 * bandwidth)
+    slow = (f >= 0.1 * bandwidth) & (f <= 0.5 * bandwidth)
     back = 1.0 / s[slow] - 1.0
     slope = tuned.plant.slope * float(np.median(np.abs(back) / np.abs(linear.response(2.0 * pi * f[slow]))))
     character = stage.character

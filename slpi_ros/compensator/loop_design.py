@@ -32,8 +32,8 @@ LOWEST, FREQUENCIES = 1e-3, 300
 FOR_NOISE = 0.03
 # Bounds of damping and width of a notch, and of its frequency over that of the mode.
 DAMPINGS, WIDTHS, BESIDE_MODE = (1e-4, 3.0), (0.03, 10.0), (0.75, 1.33)
-# A time of a controller that is none, in periods; population and generations of the search.
-NONE, POPULATION, GENERATIONS = 0.01, 10, 60
+# A time of a controller that is none, in periods; population for each number, at most, and generations of the search.
+NONE, POPULATION, MOST_TRIED, GENERATIONS = 0.01, 10, 60, 60
 # |S| at the bandwidth: -3 dB.
 HALF = 0.5**0.5
 # Longest step, in periods, and in times of the bandwidth; what counts as settled; size of the step over the stroke.
@@ -194,6 +194,8 @@ class Design:
 
     def settling(self, within: float) -> float:
         """Return the time (s) after which the error of a step of 1 stays `within`; infinite if it does not."""
+        if not within > 0.0:
+            return inf
         t, error = self.step()
         outside = np.flatnonzero(np.abs(error) > within)
         if not outside.size:
@@ -354,7 +356,7 @@ def _best(loop: Loop, margin: float, quick: bool = False) -> Shape:
 
     size = len(bounds)
     starts = np.array(_starts(loop)).clip(lowest, largest)
-    others = np.random.default_rng(0).uniform(lowest, largest, (max(POPULATION * size - len(starts), 5), size))
+    others = np.random.default_rng(0).uniform(lowest, largest, (min(POPULATION * size, MOST_TRIED), size))
     found = differential_evolution(
         loss, bounds, (loop.hardest,), init=np.vstack([starts, others]), maxiter=GENERATIONS // (2 if quick else 1),
         tol=1e-4, seed=0, polish=False,

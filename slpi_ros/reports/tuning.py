@@ -144,9 +144,9 @@ def write_files(
 def _show_measured(bode: Chart, measured: FrequencyResponse) -> None:
     """Add what was measured, with its interval of 95 %."""
     size, half = np.abs(measured.response), measured.interval
-    bode.line(0, "95 % interval", measured.frequency, size + half, NOISE, width=1.0)
-    bode.line(0, "95 % interval", measured.frequency, np.maximum(size - half, 0.01 * size), NOISE, width=1.0)
-    sure = measured.relative < 1.0
+    sure = half < size
+    for edge in (size + half, size - half):
+        bode.line(0, "95 % interval", measured.frequency, np.where(sure, edge, np.nan), NOISE, width=1.0)
     bode.dots(0, "measured", measured.frequency[sure], size[sure], AFTER)
     angle = np.unwrap(np.angle(measured.response[sure]))
     bode.dots(1, "measured", measured.frequency[sure], angle, AFTER)

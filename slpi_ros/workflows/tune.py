@@ -51,7 +51,7 @@ def tune(request: TuneRequest) -> TuneOutcome:
         axis = model.axes[name]
         try:
             measured = _measured(record, name)
-            shape = _beside_model(axis, measured) if measured else None
+            shape = beside_model(axis, measured) if measured else None
             designs[name] = design(axis, request.rate, request.margin, shape)
         except SlpiError as error:
             raise type(error)(f"axis '{name}': {error}") from None
@@ -66,7 +66,7 @@ def _measured(record: Record | None, name: str) -> FrequencyResponse | None:
     return frequency_response(record.t, record.voltage[name], record.displacement[name])
 
 
-def _beside_model(axis: AxisModel, measured: FrequencyResponse) -> tuple[FloatArray, ComplexArray] | None:
+def beside_model(axis: AxisModel, measured: FrequencyResponse) -> tuple[FloatArray, ComplexArray] | None:
     """Return frequencies (rad/s) and what was measured over what the model says, 1 at the lowest, (M,) each."""
     sure = measured.relative <= SURE
     if np.count_nonzero(sure) < 3:

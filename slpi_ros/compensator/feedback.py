@@ -135,7 +135,8 @@ class Feedback:
     def _filter_next(self, now_ns: int, elapsed: float, error: float, measured: float) -> Filtered | None:
         """Return error and reading (m) after the filter; None if there is none."""
         gains, pace = self.gains, self.pace
-        if not gains.filters or not isfinite(error):
+        if not (gains.filters and self.enabled) or not isfinite(error):
+            self._filter = None
             return None
         found = self._filter
         if found is None or found.period != pace.period:

@@ -24,6 +24,8 @@ MESSAGES = 3e-4
 STEEPER = 0.05
 # So many standard uncertainties less damping.
 UNCERTAIN = 2.0
+# Scales of the frequencies of a measured response.
+MEASURED_OFF = (1.0 - DETUNING, 1.0 - DETUNING / 2.0, 1.0, 1.0 + DETUNING / 2.0, 1.0 + DETUNING)
 # Detunings of all modes alike, and most modes of which all combinations are looked at.
 STEPS, COMBINED = 9, 3
 # The lowest frequency over the slowest rate of the loop, and the number of frequencies.
@@ -90,7 +92,8 @@ class Loop:
         slowest = min([highest, *np.abs(poles), 1.0 / max(self.nominal.delay, 1e-9)])
         near = (np.abs(poles.imag)[:, None] - poles.real[:, None] * BESIDE).ravel()
         spread = [2.0 * pi * mode.frequency * np.linspace(0.7, 1.4, 60) for mode in self.modes]
-        omega = np.concatenate([np.geomspace(LOWEST * slowest, highest, FREQUENCIES), near, *spread])
+        seen = [scale * self.measured[0] for scale in MEASURED_OFF] if self.measured else []
+        omega = np.concatenate([np.geomspace(LOWEST * slowest, highest, FREQUENCIES), near, *spread, *seen])
         return np.unique(omega[(omega >= LOWEST * slowest) & (omega <= highest)])
 
     @cached_property
@@ -100,9 +103,11 @@ class Loop:
         rows = [DiscreteLoop(each, PidGains(1.0), self.period).response(self.omega) for each in plants]
         if self.measured:
             omega, ratio = self.measured
-            size = np.interp(self.omega, omega, np.log(np.abs(ratio)), left=0.0, right=0.0)
-            angle = np.interp(self.omega, omega, np.unwrap(np.angle(ratio)), left=0.0, right=0.0)
-            rows.append(rows[0] * (1.0 + STEEPER) * np.exp(size + 1j * angle))
+            sizes, angles = np.log(np.abs(ratio)), np.unwrap(np.angle(ratio))
+            # Modes that the model does not know are detuned, too.
+            for scale in MEASURED_OFF:
+                size, angle = (np.interp(self.omega, scale * omega, of, left=0.0, right=0.0) for of in (sizes, angles))
+                rows.append(rows[0] * (1.0 + STEEPER) * np.exp(size + 1j * angle))
         return np.array(rows)
 
     @cached_property

@@ -14,6 +14,7 @@ RUN apt-get update \
         python3-numpy \
         python3-pandas \
         python3-pip \
+        python3-ruamel.yaml \
         python3-scipy \
         python3-threadpoolctl \
         ros-jazzy-rosbag2-storage-mcap \

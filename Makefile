@@ -3,7 +3,7 @@
 PYTHON ?=
 export PYTHON
 
-# Other versions of the dependencies: jazzy, minimum or newest (tools/make_venv.sh), each in folders of its own.
+# Other versions of the dependencies: jazzy, minimum, newest or kilted (tools/make_venv.sh), each in folders of its own.
 ENVIRONMENT ?=
 SUFFIX := $(if $(ENVIRONMENT),-$(ENVIRONMENT))
 INSTALL := install$(SUFFIX)
@@ -31,7 +31,7 @@ PYTEST := $(IN_WORKSPACE) $(COMPILED) $(VENV) -m pytest -n 3
 
 # What .venv has to be made for: a copied checkout, another Python or a newly sourced ROS needs another one.
 WANTED := $(CURDIR) ROS_DISTRO=$(ROS_DISTRO) $(if $(PYTHON),PYTHON=$(PYTHON))
-ifeq ($(ENVIRONMENT),newest)
+ifneq ($(filter newest kilted,$(ENVIRONMENT)),)
 # the newest of today
 $(VENV_STAMP): FORCE
 endif
@@ -42,14 +42,15 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test test-long test-jazzy test-newest test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-recorder bench-oscillation bench-tune bench-export bench-coverage bench-identification test-export-arm bench-company FORCE
+.PHONY: help build test test-long test-jazzy test-newest test-kilted test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-recorder bench-oscillation bench-tune bench-export bench-coverage bench-identification test-export-arm bench-company FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
 	@echo 'make test       build, lint, types, docstrings, tests: ten minutes on two cores'
 	@echo 'make test-long  build, then the tests that take long, and properties with more examples'
 	@echo 'make test-jazzy    the versions of Ubuntu 24.04 with Python 3.12: the quick tests of make test'
-	@echo 'make test-newest   the same tests with the newest versions of today; make test-minimum with the oldest allowed'
+	@echo 'make test-newest   the same tests with the newest versions of today, Python 3.13 if it is there; make test-minimum with'
+	@echo '                   the oldest allowed; make test-kilted with the newest and ROS 2 Kilted'
 	@echo 'make docs       build, then the documentation site: docs/_build/html/index.html'
 	@echo 'make schemas    what the schemas say of effects, anew from the effects'
 	@echo 'make package    source distribution and wheel, installed and tried in a fresh environment without ROS'
@@ -66,7 +67,8 @@ help:
 	@echo 'make bench-device-faults  faults of simulated devices: what moves, how long a call waits, when it is told, 4 minutes'
 	@echo 'make bench-device-lives   calibration, scan and verification through every driver and without one, 24 minutes'
 	@echo 'make bench-surroundings  hidden temperature and load: right topic, gain, decoys, a later day; half an hour'
-	@echo 'make bench-platforms  RECORD=table.csv: the ten commands with the versions of Ubuntu 24.04: the same figures?'
+	@echo 'make bench-platforms  RECORD=table.csv: the ten commands with the versions of Ubuntu 24.04, the newest, and those beside'
+	@echo '                   Kilted: the same figures? PLATFORMS="jazzy" chooses some of them'
 	@echo 'make bench-restarts   a compensator that is killed and started again: time to its first answer, 10 minutes; RESTARTS="--beside PYTHON"'
 	@echo 'make bench-company    200 lives of nodes beside each other: voltages from what must not move, refusals; half an hour; COMPANY="--lives 60"'
 	@echo 'make bench-soak     10 minutes at 1 kHz, 1 minute at 5 kHz, and the ceiling'
@@ -122,7 +124,7 @@ test-long: build
 	$(PYTEST) -m 'long or hypothesis'
 
 # The tests of `make test` that take no more than ten seconds.
-test-jazzy test-newest test-minimum:
+test-jazzy test-newest test-kilted test-minimum:
 	@$(MAKE) --no-print-directory ENVIRONMENT=$(@:test-%=%) test-environment
 
 test-environment: export SLPI_EXAMPLES = 10
@@ -163,10 +165,11 @@ bench-next-record: build
 bench-start-memory: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/start_memory.py
 
-# Both environments on one record, say RECORD=afm_double_sine_x.csv
+# All environments on one record, say RECORD=afm_double_sine_x.csv
+PLATFORMS := jazzy newest kilted
 bench-platforms: build
-	@$(MAKE) --no-print-directory ENVIRONMENT=jazzy build
-	$(VENV) benchmarks/platforms.py $(RECORD) .venv .venv-jazzy
+	@for each in $(PLATFORMS); do $(MAKE) --no-print-directory ENVIRONMENT=$$each build || exit; done
+	$(VENV) benchmarks/platforms.py $(RECORD) .venv $(PLATFORMS:%=.venv-%)
 
 bench-latency: build
 	$(IN_OWN_DOMAIN) $(VENV) benchmarks/latency.py --keep

@@ -47,6 +47,7 @@ setup(
         "osqp>=1.0.0,<2",
         "pandas>=2.1.4",
         "rosbags>=0.11.6",
+        "ruamel.yaml>=0.17.21",
         "scipy>=1.11.4",
         "threadpoolctl>=3.1.0",
     ],

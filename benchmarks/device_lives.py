@@ -93,8 +93,7 @@ def scanned(name, seed, folder):
         at.wait_until("states", lambda: len(at.state.position) > 0)
         given = {"model_file": model, "voltage_min": V_MIN, "voltage_max": V_MAX, "realtime_priority": PRIORITY}
         life.enter_context(executable("compensator", log="error", **given))
-        at.wait_until("the compensator", lambda: at.count_subscribers("desired_displacement") >= 1)
-        time.sleep(SETTLE)
+        at.await_compensator()
         at.reset("/compensator")
         here = float(at.state.position[0])
         approach = here + (y[0] - here) * (1.0 - np.cos(np.linspace(0.0, np.pi, int(PATH_RATE)))) / 2.0

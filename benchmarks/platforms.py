@@ -1,7 +1,7 @@
-"""The ten commands of the command line on one measured record in two environments: are the figures the same?
+"""The ten commands of the command line on one measured record in several environments: are the figures the same?
 
 Each command runs with ``--json`` in each environment. Every number of its document is compared with the same number of
-the other environment: a list of numbers by its largest difference over its largest value, a number of its own by the
+the first environment: a list of numbers by its largest difference over its largest value, a number of its own by the
 difference over the larger of the two. What is a difference between two nearly equal figures (a change of gain, an
 offset) is compared with the figure that it is a part of.
 """
@@ -109,42 +109,43 @@ def stream_costs(pythons: list[Path]) -> list[list[float]]:
 
 
 def main() -> None:
-    """Print the figures of both environments and the largest differences; exit code 1 if one is above the limit."""
+    """Print the figures of all environments and the largest differences; exit code 1 if one is above the limit."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("record", type=Path, help="table of a measured record, for example afm_double_sine_x.csv")
-    parser.add_argument("environments", nargs=2, type=Path, help="for example .venv .venv-jazzy")
+    parser.add_argument("first", type=Path, help="environment that the others are compared with, for example .venv")
+    parser.add_argument("others", nargs="+", type=Path, help="for example .venv-jazzy .venv-newest")
     parser.add_argument("--limit", type=float, default=0.01, help="largest relative difference; default: 0.01")
     options = parser.parse_args()
-    pythons = [ROOT / environment / "bin" / "python" for environment in options.environments]
+    pythons = [ROOT / environment / "bin" / "python" for environment in (options.first, *options.others)]
     for python in pythons:
         print(subprocess.check_output([python, ROOT / "tools" / "list_versions.py"], text=True), end="")
+    print(f"{'command':<16} {'environment':<16} {'numbers':>8} {'largest difference':>19} {'s':>6}  where, and figures")
     with tempfile.TemporaryDirectory() as name:
-        folders = [Path(name) / f"{k}" for k in range(2)]
-        for folder in folders:
-            folder.mkdir()
+        runs = []
+        for k, python in enumerate(pythons):
+            (folder := Path(name) / f"{k}").mkdir()
+            runs.append(run(python, options.record.resolve(), folder))
         worst = 0.0
-        runs = (run(python, options.record.resolve(), folder) for python, folder in zip(pythons, folders, strict=True))
-        print(f"{'command':<16} {'numbers':>8} {'largest difference':>19} {'s':>6} {'s':>6}  where, and figures")
-        for (command, one, took), (_, other, also) in zip(*runs, strict=True):
+        for (command, one, took), *others in zip(*runs, strict=True):
             shown = next(figures for name_, _, figures in COMMANDS if name_ == command)
-            missing = sorted(one.keys() ^ other.keys())
-            found = [(difference(place, one[place], other[place]), place) for place in one.keys() & other.keys()]
-            most, place = (float("inf"), missing[0]) if missing else max(found)
-            worst = max(worst, most)
-            told = [f"{figure.rsplit('/', 1)[-1]} {one[figure]:.6g} / {other[figure]:.6g}" for figure in shown]
-            where = f"{place} " if most else ""
-            print(
-                f"{command:<16} {len(found):8d} {most:19.2e} {took:6.1f} {also:6.1f}  {where}{'; '.join(told)}",
-                flush=True,
-            )
+            told = "; ".join(f"{figure.rsplit('/', 1)[-1]} {one[figure]:.6g}" for figure in shown)
+            print(f"{command:<16} {options.first!s:<16} {len(one):8d} {'':>19} {took:6.1f}  {told}", flush=True)
+            for environment, (_, other, also) in zip(options.others, others, strict=True):
+                missing = sorted(one.keys() ^ other.keys())
+                found = [(difference(place, one[place], other[place]), place) for place in one.keys() & other.keys()]
+                most, place = (float("inf"), missing[0]) if missing else max(found)
+                worst = max(worst, most)
+                where = place if most else ""
+                print(f"{'':<16} {environment!s:<16} {len(found):8d} {most:19.2e} {also:6.1f}  {where}", flush=True)
     print(f"largest difference: {worst:.2%}; limit {options.limit:.0%}")
-    costs = stream_costs(pythons)
-    one, other = (statistics.median(each) for each in zip(*costs, strict=True))
-    ratios = sorted(b / a for a, b in costs)
-    print(
-        f"one streamed voltage, us of processor time: {one:.2f} / {other:.2f}; ratio {statistics.median(ratios):.2f} "
-        f"({ratios[0]:.2f} to {ratios[-1]:.2f} of {STREAMS} runs in turn); load of the machine {os.getloadavg()[0]:.1f}"
-    )
+    costs = [*zip(*stream_costs(pythons), strict=True)]
+    for environment, each in zip((options.first, *options.others), costs, strict=True):
+        ratios = sorted(b / a for a, b in zip(costs[0], each, strict=True))
+        print(
+            f"one streamed voltage, us of processor time: {environment!s:<16} {statistics.median(each):.2f}; ratio "
+            f"{statistics.median(ratios):.2f} ({ratios[0]:.2f} to {ratios[-1]:.2f} of {STREAMS} runs in turn)"
+        )
+    print(f"load of the machine {os.getloadavg()[0]:.1f}")
     sys.exit(worst > options.limit)
 
 

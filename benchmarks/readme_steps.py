@@ -242,7 +242,7 @@ def moved(user: Readme, seed: int, model: slpi_ros.StageModel, history: str, to:
         voltages.publish(Float64MultiArray(data=[to]))
         user.spin(0.1)
     compensator = user.compensator()
-    user.spin(3 * SETTLE_S)
+    user.spin(5 * SETTLE_S)
     before = user.errors(model)
     user.reset()
     after = user.errors(model)

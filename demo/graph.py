@@ -71,6 +71,17 @@ class Operator(Node):
             values = {pair.key: pair.value for pair in status.values}
             self._reports += [values] if "held_at_limit" in values else []
 
+    def await_compensator(self) -> None:
+        """Wait until a compensator that has just been started has found nobody else, and takes commands."""
+        self._reports.clear()
+        self.wait_until(
+            "the compensator to be ready",
+            lambda: (
+                any(values["state"] == "active" and not values["obstacle"] for values in list(self._reports))
+                and self.count_subscribers("desired_displacement") >= 1
+            ),
+        )
+
     def held_at_limit(self) -> int:
         """Return how many displacements the compensator has held at a voltage limit so far."""
         before = len(self._reports)

@@ -37,8 +37,6 @@ V_MIN, V_MAX, SLEW = 0.0, 100.0, 1000.0
 # The calibration runs faster than in life; the comparison is in real time, on the next day of the stage.
 SPEED = 4.0
 NOISE = 8e-9
-# The graph shows a node a moment before its topics are connected, seconds.
-SETTLE = 2.0
 KINDS = {"pi": "classical PI", "slpi": "SLPI"}
 
 
@@ -79,13 +77,7 @@ def follow_uncompensated(stage: Operator, t: FloatArray, y: FloatArray, low: flo
 def follow_compensated(stage: Operator, name: str, model: Path, t: FloatArray, y: FloatArray) -> plots.Run:
     """Follow a path with the compensator in between."""
     with executable("compensator", log="error", model_file=str(model), voltage_min=V_MIN, voltage_max=V_MAX):
-        stage.wait_until(
-            "the compensator to be ready",
-            lambda: (
-                stage.count_publishers("voltage_command") >= 2 and stage.count_subscribers("desired_displacement") >= 1
-            ),
-        )
-        time.sleep(SETTLE)
+        stage.await_compensator()
         stage.reset("/compensator")
         # To the begin of the path without a jump, from where the reset has left the stage.
         at = float(stage.state.position[0])

@@ -28,6 +28,7 @@ HOW_TO_GET = {
     "pymodbus": "pip install 'slpi_ros[labjack]', or pip install pymodbus",
     "serial": "apt install python3-serial, or pip install pyserial",
     "rosbags": "pip install rosbags",
+    "ruamel": "apt install python3-ruamel.yaml, or pip install ruamel.yaml",
     "scipy": "apt install python3-scipy, or pip install scipy",
     "threadpoolctl": "apt install python3-threadpoolctl, or pip install threadpoolctl",
     "yaml": "apt install python3-yaml, or pip install pyyaml",

@@ -25,6 +25,8 @@ FLEET = {"bokeh", "dask", "distributed", "pyarrow"}
 def run(folder, name, contents, *command):
     """Run Python with a module of this name and contents in the place of the installed one."""
     (folder / f"{name}.py").write_text(contents)
+    # A namespace package may be loaded already when Python starts (ruamel.yaml 0.17 by its .pth file).
+    (folder / "sitecustomize.py").write_text(f"import sys\nsys.modules.pop({name!r}, None)\n")
     environment = {**os.environ, "PYTHONPATH": f"{folder}{os.pathsep}{ROOT}"}
     return subprocess.run([sys.executable, *command], env=environment, cwd=folder, capture_output=True, text=True)
 
@@ -64,6 +66,7 @@ def test_setup_py_and_the_ways_to_get_packages_name_the_same_ones():
         ("osqp", "identify bag -o other.json"),
         ("osqp", "diagnose bag --model model.json -o diagnosis"),
         ("rosbags", "import table.csv -o other"),
+        ("ruamel", "identify bag -o other.json"),
         ("pandas", "import table.csv -o other"),
         ("threadpoolctl", "refit model.json bag -o other.json"),
         ("jsonschema", "show wrong.json"),

@@ -17,7 +17,7 @@ sys.path.append(str(ROOT / "tools"))
 import check_package  # noqa: E402
 
 # Names that differ between PyPI and rosdep, and what rosdep has no key for.
-ROSDEP = {"rosbags": "python3-rosbags-pip"}
+ROSDEP = {"rosbags": "python3-rosbags-pip", "ruamel": "python3-ruamel.yaml"}
 NO_KEY = {"osqp", "threadpoolctl", "setuptools"}
 
 

@@ -1,15 +1,18 @@
 """Send a sine of 5 µm amplitude around 10 µm, one period in a second, at 1 kHz; the stage has 0.2 s to get there."""
 
 import math
+import signal
 
 import rclpy
 from diagnostic_msgs.msg import DiagnosticArray
 from rclpy.duration import Duration
+from rclpy.signals import SignalHandlerOptions
 from trajectory_msgs.msg import JointTrajectory, JointTrajectoryPoint
 
 RATE_HZ, SAMPLES, LEAD_NS = 1000, 1001, 200_000_000
 
-rclpy.init()
+rclpy.init(signal_handler_options=SignalHandlerOptions.NO)
+signal.signal(signal.SIGINT, signal.SIG_DFL)  # Ctrl-C ends it without a traceback
 node = rclpy.create_node("planner")
 publisher = node.create_publisher(JointTrajectory, "desired_trajectory", 10)
 ready = set()

@@ -287,6 +287,7 @@ class Controller:
 
         Return whether somebody else has begun to move, command or report an axis; all then stops until `arm`.
         """
+        self.ownership.hear(now_ns)
         if stage is not None:
             self.ownership.stage.hear(stage, now_ns)
         for name, voltage in zip(names, voltages, strict=False):
@@ -296,6 +297,8 @@ class Controller:
         if not self.ownership.lost(now_ns):
             return False
         self.stop(StopReason.LOST, now_ns)
+        if self.ownership.armed:
+            self.stopped = None
         return True
 
     def locate(self, now_ns: int) -> None:
@@ -561,7 +564,7 @@ class Controller:
         for axis in self.axes:
             axis.output.checked = False
             if reason is StopReason.LOST:
-                axis.begin(Fault(), now_ns)
+                axis.begin(Idle() if self.ownership.armed else Fault(), now_ns)
                 continue
             axis.stop(now_ns)
             if self.ownership.owned:

@@ -132,7 +132,7 @@ class Loop:
         """Replace the settings without a voltage step; feedback that was switched off for a fault resumes."""
         if self.fault:
             # What the sensor told before does not count any more.
-            self.sensor.begin(now_ns)
+            self.sensor.begin()
         self.settings, self.active = settings, self.closed and settings.enabled
         self.fault = self._unstable()
         self.oscillation.begin(now_ns)
@@ -162,7 +162,7 @@ class Loop:
         self._feedback = Feedback(settings.gains, self._output, settings.correction_limit)
         # The feedforward has a rate limiter of its own, beside that of the total voltage.
         stream.pace = self._output.copy()
-        self.sensor.begin(now_ns)
+        self.sensor.begin()
         self.oscillation.begin(now_ns)
         self.closed, self.active = True, settings.enabled
         self.driven_ns = self.due_ns = now_ns

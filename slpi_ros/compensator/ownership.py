@@ -1,6 +1,6 @@
 """Who owns the voltages of a stage: where they start, and whether somebody else moves it."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 from slpi_ros.compensator.amplifier import MUTE_NS, STEADY_NS
 from slpi_ros.compensator.axis import Axis
@@ -26,6 +26,7 @@ class Ownership:
     def __init__(
         self, axes: Sequence[Axis], starts: Sequence[str | float] = (), stage: WhoseStage | None = None
     ) -> None:
+        self.left: Mapping[str, float] | None = None  # V, where this node left the stage, if that is known
         self.reporting = self.started = False  # ``stage_state`` has a publisher; a voltage was output
         self.obstacle: tuple[str, str] | None = None  # cause and reason why no voltage may be output
         self.notes: dict[str, str] = {}  # by axis: what is not certain about the voltage at the start
@@ -37,7 +38,8 @@ class Ownership:
         self.monitor = Monitor(*(axis.amplifier for axis in axes))
         self._axes = axes
         self._starts = list(starts) or [AUTO] * len(axes)  # `AUTO`, `MEASURED`, `SAVED`, or volts
-        self._since_ns, self._begun_ns, self._ever = 0, 0, False
+        self.begun_ns = 0  # when the output began
+        self._since_ns, self._heard_ns, self._ever = 0, 0, False
 
     @property
     def armed(self) -> bool:
@@ -49,9 +51,13 @@ class Ownership:
         """Whether voltages are being output."""
         return self.started and self.obstacle is None
 
+    def hear(self, now_ns: int) -> None:
+        """Take that `stage_state` has come."""
+        self._heard_ns = self._heard_ns or now_ns
+
     def await_start(self, now_ns: int) -> None:
         """Find the voltages anew before the next output."""
-        self.started, self._since_ns = False, now_ns
+        self.started, self._since_ns, self._heard_ns = False, now_ns, 0
         self.obstacle = STARTING, "the voltages at the start are not known yet; send it again"
 
     def locate(self, now_ns: int) -> None:
@@ -59,6 +65,8 @@ class Ownership:
         if self.listening and any(axis.amplifier.moves(now_ns) for axis in self._axes):
             # Somebody commands it whom the middleware may not have found yet.
             self.listening.hear(now_ns)
+        if self.listening:
+            self.listening.thorough = not self._is_as_left(now_ns)
         if found := self._stranger(now_ns) or (self.listening and self.listening.check(now_ns)):
             self.obstacle = STARTING, str(found)
             return
@@ -70,6 +78,15 @@ class Ownership:
                 continue
             axis.locate(at, now_ns)
         self.obstacle = (STARTING, missing) if missing else None
+
+    def _is_as_left(self, now_ns: int) -> bool:
+        """Return whether the amplifiers are where this node left them: nobody else has moved the stage since."""
+        found = [(axis, axis.amplifier.found(now_ns, self._since_ns)) for axis in self._axes]
+        left = self.left or {}
+        return all(
+            v is not None and axis.name in left and abs(v - left[axis.name]) <= axis.amplifier.tolerance()
+            for axis, v in found
+        )
 
     def _find(self, axis: Axis, start: str | float, now_ns: int) -> tuple[float | None, str]:
         """Return the voltage (V) at which an axis starts, and what is not certain about it; None: not known yet."""
@@ -86,7 +103,9 @@ class Ownership:
             # The last output is known better than a noisy report of it.
             same = self._ever and abs(found - v) <= axis.amplifier.scatter
             return (v if same else found), ""
-        awaited = self.reporting and (now_ns - self._since_ns < MUTE_NS or axis.amplifier.latest is not None)
+        # Of a publisher that has said nothing it is not known what it reports.
+        mute = self._heard_ns and now_ns - self._heard_ns >= MUTE_NS and axis.amplifier.latest is None
+        awaited = self.reporting and not mute
         if start == MEASURED or awaited:
             return None, (
                 "waiting for the voltage of the amplifier (effort of stage_state); check its driver, or set "
@@ -107,7 +126,7 @@ class Ownership:
         if self.obstacle:
             raise RejectedError(*self.obstacle)
         if not self.started:
-            self.started, self._ever, self._begun_ns = True, True, now_ns
+            self.started, self._ever, self.begun_ns = True, True, now_ns
             for axis in self._axes:
                 self._take(axis, now_ns)
 
@@ -115,7 +134,12 @@ class Ownership:
         """Return whether somebody else has begun to move or to report an axis; nothing is then output until `arm`."""
         if not (self.started and self.armed):
             return False
-        found = self._stranger(now_ns) or (self.listening and self.listening.heard_since(self._begun_ns))
+        found = self._stranger(now_ns) or (self.listening and self.listening.heard_since(self.begun_ns))
+        if found and self.listening and self.listening.on:
+            # Somebody who was there before and is found only now, or who has begun at the same time.
+            self.listening.give_way(now_ns)
+            self.await_start(now_ns)
+            return True
         if not found:
             self.monitor.check(now_ns)
             found = next(iter(self.monitor.standing), None)
@@ -140,7 +164,7 @@ class Ownership:
             if reason := self._impossible(axis, voltage):
                 return f"axis '{axis.name}': {reason}"
             found.append(voltage)
-        self._begun_ns = now_ns
+        self.begun_ns = now_ns
         for axis, voltage in zip(self._axes, found, strict=True):
             # The last output of an axis that nobody moved is known better than a noisy report of it.
             if axis.amplifier.foreign or abs(voltage - axis.voltage) > axis.amplifier.scatter:

@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 
 from slpi_ros.errors import ModelError
 from slpi_ros.io.atomic_file import all_or_nothing, remove_file
+from slpi_ros.io.file_lock import lock
 from slpi_ros.io.input_limits import MEMORY_BYTES, MODEL_BYTES, open_input, read_input
 from slpi_ros.io.schemas import validate
 from slpi_ros.model.document import format_model
@@ -64,12 +65,16 @@ class Zero:
         return cls(source, offset, datetime.now(UTC).isoformat(timespec="seconds"))
 
 
+KEPT = "{}: another process keeps it; give each compensator a memory_file of its own"
 # An entry: identifier of the saved memory that it belongs to, sequence number, voltages, and their checksum.
 HEAD, CHECKSUM = struct.Struct("=IQ"), struct.Struct("=I")
 
 
 class LastVoltages:
-    """Store the voltages of every command in the file `path`.last; one write takes about two microseconds."""
+    """Store the voltages of every command in the file `path`.last; one write takes about two microseconds.
+
+    One process at a time keeps them: the file is locked as long as that process lives.
+    """
 
     # Two entries with checksums are written alternately, so one of them is intact after a crash of the process. The
     # data is not flushed to the disk: it survives the end of the process, but may be lost at a power failure. `mark` is
@@ -77,14 +82,16 @@ class LastVoltages:
     def __init__(self, path: str | os.PathLike[str], mark: int) -> None:
         self._path, self.mark, self._number = _beside(path), mark, 0
         try:
-            self._file = os.open(
-                self._path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NONBLOCK | os.O_CLOEXEC, 0o644
-            )
+            self._file = os.open(self._path, os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o644)
         except (OSError, ValueError) as error:
             raise ModelError(f"{path}: cannot be written: {error}; choose another path") from None
         if not stat.S_ISREG(os.fstat(self._file).st_mode):
             os.close(self._file)
             raise ModelError(f"{self._path}: cannot be written: no regular file; choose another path")
+        if not lock(self._file):
+            os.close(self._file)
+            raise ModelError(KEPT.format(path))
+        os.ftruncate(self._file, 0)
 
     def note(self, voltages: bytes) -> None:
         """Write the voltages (V) of all axes, each as a double in native byte order."""
@@ -97,9 +104,18 @@ class LastVoltages:
             raise ModelError(f"{self._path}: cannot be written: {error.strerror}; free disk space") from None
 
     def discard(self) -> None:
-        """Close and delete the file."""
-        os.close(self._file)
+        """Delete and close the file."""
         remove_file(self._path)
+        os.close(self._file)
+
+
+def is_kept(path: str | os.PathLike[str]) -> bool:
+    """Return whether a living process keeps the last voltages of a saved memory."""
+    try:
+        with open_input(_beside(path), MEMORY_BYTES) as file:
+            return not lock(file.fileno(), shared=True)
+    except (OSError, ValueError):
+        return False
 
 
 def read_last_voltages(path: str | os.PathLike[str], mark: int, axes: int) -> tuple[float, ...] | None:
@@ -245,6 +261,8 @@ class MemoryFile:
             return
         if self._saved is None:
             _require_no_other(self.path)
+            if self.used:
+                raise ModelError(KEPT.format(self.path))
         try:
             mark = save_memory(memory, self.path)
         except ModelError:
@@ -260,6 +278,11 @@ class MemoryFile:
             self._last.mark = mark
         elif not complete:
             self._last = LastVoltages(self.path, mark)
+
+    @property
+    def used(self) -> bool:
+        """Whether another process keeps it."""
+        return self._last is None and is_kept(self.path)
 
     def note(self, voltages: bytes) -> None:
         """Store the voltages just output (V, native doubles), for recovery after a crash; called for each command."""

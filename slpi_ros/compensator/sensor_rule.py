@@ -80,14 +80,14 @@ class SensorRule(Rule):
         self.excused = False  # whether the readings tell of an oscillation, which another rule judges
         self._limits = limits or SensorLimits()
         self._readings: deque[tuple[int, float, float]] = deque(maxlen=KEPT)  # ns, expected (m), reading (m)
-        self._silence: Silence | None = None  # None: not begun
+        self._silence: Silence | None = None  # None: not yet awaited
         self._suspect = Lasting()
 
-    def begin(self, now_ns: int) -> None:
-        """Start to watch at `now_ns`; what was read before does not count."""
+    def begin(self) -> None:
+        """Start to watch: what was read before does not count, and readings are awaited from the next check on."""
         self._readings.clear()
         self._suspect.forget()
-        self._silence = Silence(now_ns, lambda seconds: f"no measured_displacement for {seconds:.2g} s")
+        self._silence = None
 
     def read(self, expected: float, reading: float, now_ns: int) -> None:
         """Take a reading (m), and the displacement of the model (m) at that time."""
@@ -97,8 +97,10 @@ class SensorRule(Rule):
 
     def check(self, now_ns: int) -> Finding | None:
         """Return the fault that has lasted for the fault time at `now_ns`; None without one."""
-        if self._silence is None or not self.fault_time:
+        if not self.fault_time:
             return None
+        if self._silence is None:
+            self._silence = Silence(now_ns, lambda seconds: f"no measured_displacement for {seconds:.2g} s")
         if reason := self._silence.beyond(self.fault_time, now_ns):
             return Finding("sensor", "silent", reason, self.axis)
         kind, reason = ("", "") if self.excused else self._look(now_ns)

@@ -7,18 +7,20 @@ import subprocess
 import tempfile
 import zipfile
 from dataclasses import dataclass
+from math import inf
 from pathlib import Path
 from typing import Any
 
 from slpi_ros.errors import SlpiError
 from slpi_ros.export.c_source import c_files, comment, templates
 from slpi_ros.export.stage import ExportedStage
+from slpi_ros.model.limits import MAX_DT
 
 VERSIONS = ("3.0", "2.0")
 # Names of the folder of the binary, by version, and the time that every file in a unit has.
 PLATFORM, EPOCH = {"3.0": "x86_64-linux", "2.0": "linux64"}, (2000, 1, 1, 0, 0, 0)
-# Usual step of a simulation (s).
-STEP = 1e-4
+# Usual step of a simulation (s), and the longest of an inverse with a slew limit, which takes it in parts of MAX_DT.
+STEP, LONGEST_STEP = 1e-4, 1000.0
 # Says, as the last bytes of the archive, who wrote it.
 MARK = b"Written by `slpi export`"
 
@@ -38,6 +40,10 @@ class Unit:
         if self.given[1] == "V":
             return [axis.allowed.clip(axis.memory.voltage) for axis in stage.axes]
         return [axis.model.rest(axis.limits) for axis in stage.axes]
+
+    def limited(self, stage: ExportedStage) -> bool:
+        """Return whether a slew limit of the stage acts on the outputs."""
+        return self.answered[1] == "V" and any(axis.allowed.slew < inf for axis in stage.axes)
 
 
 UNITS = (
@@ -97,7 +103,7 @@ def fmu(stage: ExportedStage, unit: Unit, version: str) -> bytes:
         each["reference"] = k
     context: dict[str, Any] = {
         "limits": [(repr(axis.allowed.lower), repr(axis.allowed.upper)) for axis in stage.axes] if loops else [],
-        "quantities": quantities,
+        "quantities": quantities, "limited": unit.limited(stage), "longest": repr(MAX_DT), "most": repr(LONGEST_STEP),
         "version": version, "what": unit.what, "file": file, "token": f"{{{token}}}", "starts": starts,
         "function": unit.function, "identifier": unit.identifier,
         "step": repr(loops[0].period if loops else STEP),

@@ -231,7 +231,9 @@ def without(x: FloatArray, outliers: IntArray) -> FloatArray:
     """Return readings `x`, shape (N,), with outliers replaced by linear interpolation between their neighbours."""
     if not outliers.size:
         return x
-    good = np.setdiff1d(np.arange(x.size), outliers)
+    kept = np.ones(x.size, dtype=bool)
+    kept[outliers] = False
+    good = np.flatnonzero(kept)
     cleaned = x.copy()
     cleaned[outliers] = np.interp(outliers, good, x[good])
     return cleaned

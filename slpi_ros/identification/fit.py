@@ -112,10 +112,10 @@ def identify(
                         warnings.warn_explicit(warning.message, warning.category, warning.filename, warning.lineno)
                 else:
                     # What the first fit warned of may be due to the outliers; the second one warns for itself.
-                    samples = good
+                    samples, again = good, fitted.again
                     # The first one holds the memory of its problem.
                     del fitted
-                    fitted = fit(samples)
+                    fitted = again(samples)
                     model = _axis_model(kind, fitted, source)
                 _require_sense(fitted)
                 model = replace(model, quality=replace(model.quality, held_out_rms=fitted.held_out_rms))

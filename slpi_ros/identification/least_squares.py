@@ -3,7 +3,7 @@
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.linalg
@@ -31,6 +31,7 @@ class Fitted:
     errors: FloatArray
     covered: float  # share of the parameters or loops that the samples determine
     validate: Callable[[], FloatArray]  # computes the held-out errors
+    again: Callable[[Sequence[Samples]], "Fitted"]  # the same fit to fewer of the samples, sought near this one
 
     @cached_property
     def held_out(self) -> FloatArray:
@@ -43,16 +44,21 @@ class Fitted:
         return float(np.sqrt(np.nanmean(self.held_out**2)))
 
 
-def solve_free(matrix: FloatArray, vector: FloatArray) -> FloatArray:
+def solve_free(matrix: FloatArray, vector: FloatArray, *, overwrite: bool = False) -> FloatArray:
     """Minimise ``x' M x / 2 - b' x`` without constraints; parameters and errors as in `QuadraticProgram`."""
-    return _solved(cholesky(matrix), vector)
-
-
-def _solved(root: FloatArray, vector: FloatArray) -> FloatArray:
+    root = cholesky(matrix, overwrite=overwrite)
     solution: FloatArray = scipy.linalg.cho_solve((root, True), vector, check_finite=False)
     return solution
 
 
+# Parameters, and share of entries of their matrix, from and up to which a sparse factorisation takes its place: those
+# of a loop family of many vertices are coupled to their neighbours, and to those at which the path turned.
+SPARSE_FROM, SPARSE_SHARE = 1000, 0.1
+SYMMETRIC: dict[str, Any] = {
+    "permc_spec": "MMD_AT_PLUS_A",
+    "diag_pivot_thresh": 0.0,
+    "options": {"SymmetricMode": True},
+}
 # Roughness weight for the detection of outliers and the comparison of initial states.
 FIRST_SMOOTHNESS = 0.1
 FOLDS, BLOCKS_OF_FOLD = 5, 8
@@ -79,7 +85,7 @@ class Problem:
     y: FloatArray  # in units of `scale`, (N,)
     weights: FloatArray  # 0: not fitted
     judged: Mask  # can be held out
-    rough: FloatArray  # roughness matrix, (p, p)
+    rough: sp.csr_array  # roughness matrix, (p, p)
     scale: float  # m
     gain: float  # m/V, mean
 
@@ -89,16 +95,16 @@ class Problem:
         walk = walk_of(samples, basis)
         design = Design.of(walk, basis.branch_part(walk))
         volts, metres = np.max([part.spread for part in samples], axis=0).tolist()
-        rough = np.zeros((design.local.shape[1],) * 2)
-        own = basis.roughness
-        rough[: own.shape[1], : own.shape[1]] = (own.T @ own).toarray()
+        own = sp.csr_array(basis.roughness.T @ basis.roughness)
+        rows, size = own.shape[0], design.local.shape[1]
+        pointers = np.append(own.indptr, np.full(size - rows, own.indptr[-1], own.indptr.dtype))
         return cls(
             basis=basis,
             design=design,
             y=np.concatenate([part.y for part in samples]) / metres,
             weights=np.concatenate([part.fitted for part in samples]).astype(np.float64),
             judged=np.concatenate([part.judged for part in samples]),
-            rough=rough,
+            rough=sp.csr_array((own.data, own.indices, pointers), shape=(size, size)),
             scale=metres,
             gain=metres / volts,
         )
@@ -115,7 +121,7 @@ class Problem:
 
     def penalty(self, smoothness: float, count: float) -> FloatArray:
         """Return the matrix of the roughness penalty with weight `smoothness` for `count` samples, shape (p, p)."""
-        matrix = self.rough * (smoothness * count / 1000)
+        matrix: FloatArray = (self.rough * (smoothness * count / 1000)).toarray()
         matrix[np.diag_indices_from(matrix)] += self._ridge * count
         return matrix
 
@@ -130,6 +136,13 @@ class Problem:
     def equations(self) -> tuple[FloatArray, FloatArray]:
         """Normal equations of the fitted samples: ``A' W A``, shape (p, p), and ``A' W y``, shape (p,)."""
         return self.design.normal_equations(self.y, self.weights)
+
+    @cached_property
+    def _sparse(self) -> sp.csc_array | None:
+        """The matrix of `equations`, if it is large and has few entries."""
+        matrix = self.equations[0]
+        few = len(matrix) >= SPARSE_FROM and np.count_nonzero(matrix) <= SPARSE_SHARE * matrix.size
+        return sp.csc_array(matrix) if few else None
 
     def solve(self, smoothness: float) -> Solution:
         """Return the fit to all samples in which every branch is monotone."""
@@ -171,7 +184,8 @@ class Problem:
             weights = np.zeros_like(self.weights)
             weights[chosen] = self.weights[chosen]
             square = float(weights[chosen] @ self.y[chosen] ** 2)
-            folds.append(Fold(chosen, square, *self.design.normal_equations(self.y, weights)))
+            matrix, vector = self.design.normal_equations(self.y, weights)
+            folds.append(Fold(chosen, square, matrix if self._sparse is None else sp.csc_array(matrix), vector))
         return folds
 
     def held_out_errors(self, smoothness: float, whole: Solution) -> FloatArray:
@@ -202,11 +216,14 @@ class Problem:
 
         Those next to the weight `near` are tried first: their scores tell that others need not be computed.
         """
-        best, start = near, among.index(near)
-        for smoothness in sorted(among, key=lambda each: abs(among.index(each) - start)):
-            score = self.score(smoothness, below)
-            if score < below:
-                best, below = smoothness, score
+        best, start, end = near, among.index(near), len(among)
+        for k in sorted(range(len(among)), key=lambda k: abs(k - start)):
+            if k < end:
+                score, beyond = self._scored(among[k], below)
+                # The error of a fit to all samples grows with the weight.
+                end = k if beyond else end
+                if score < below:
+                    best, below = among[k], score
         return best, below
 
     def score(self, smoothness: float, below: float = np.inf) -> float:
@@ -215,6 +232,10 @@ class Problem:
         It may be infinite where it is not less than `below` (m), which is known early: a fit to all samples with the
         same penalty has a smaller squared error on each fold than the fit to the others.
         """
+        return self._scored(smoothness, below)[0]
+
+    def _scored(self, smoothness: float, below: float) -> tuple[float, bool]:
+        """Return the score, and whether even the fit to all samples has an error of `below` (m) or more."""
         counts = np.array([self.count - fold.chosen.size for fold in self.folds])
         total = float(self.weights[np.concatenate([fold.chosen for fold in self.folds])].sum())
         lowest, squares = total * (below / self.scale) ** 2, np.zeros(len(self.folds))
@@ -224,21 +245,28 @@ class Problem:
             # The folds differ by a few samples, and so do their penalties.
             penalty = (x @ vector - x @ matrix @ x) * (counts / least - 1.0)
             squares = np.array([fold.error(x) for fold in self.folds]) - penalty
+        beyond = bool(squares.sum() >= lowest)
         for k in np.argsort(-squares).tolist():
             if squares.sum() >= lowest:
-                return np.inf
+                return np.inf, beyond
             squares[k] = self.folds[k].error(self._free(smoothness, int(counts[k]), self.folds[k]))
-        return float(np.sqrt(max(squares.sum(), 0.0) / total)) * self.scale
+        return float(np.sqrt(max(squares.sum(), 0.0) / total)) * self.scale, False
 
     def _free(self, smoothness: float, count: int, without: "Fold | None" = None) -> FloatArray:
         """Return the fit without constraints, and `without` a fold, with the penalty for `count` samples."""
         matrix, vector = self.equations
+        if without:
+            vector = vector - without.vector
+        if self._sparse is not None:
+            few = self._sparse + self.rough * (smoothness * count / 1000)
+            few = sp.csc_array(few - without.matrix if without else few)
+            few.setdiag(few.diagonal() + self._ridge * count)
+            return np.asarray(scipy.sparse.linalg.splu(few, **SYMMETRIC).solve(vector))
         whole = self.penalty(smoothness, count)
         whole += matrix
         if without:
             whole -= without.matrix
-            vector = vector - without.vector
-        return _solved(cholesky(whole, overwrite=True), vector)
+        return solve_free(whole, vector, overwrite=True)
 
 
 class Fold(NamedTuple):
@@ -246,7 +274,7 @@ class Fold(NamedTuple):
 
     chosen: IntArray  # indices
     square: float  # weighted sum of squared displacements, in units of the problem
-    matrix: FloatArray  # (p, p)
+    matrix: FloatArray | sp.csc_array  # (p, p)
     vector: FloatArray  # (p,)
 
     def error(self, x: FloatArray) -> float:

@@ -1,6 +1,7 @@
 """Convex fits of the kinds that are linear in their parameters; cross-validation selects grid and smoothness."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -17,10 +18,10 @@ from slpi_ros.model.axis_model import Start
 VERTICES = (21, 31, 41)
 SMOOTHNESS = (0.001, 0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0, 30.0)
 PLAY_OPERATORS = 30
-# Numbers of samples to which a long record is thinned: for the choice of initial state, grid and smoothness, and for
-# the final fit. More samples cost time and memory without changing the result.
-SELECTION_SAMPLES, FIT_SAMPLES = 100_000, 300_000
-# Factor on these numbers for play operators: every sample moves every operator, and there are few parameters.
+# Numbers of samples to which a long record is thinned: for the choice of the initial state, for that of grid and
+# smoothness, and for the final fit. More samples cost time and memory without changing the result.
+START_SAMPLES, SELECTION_SAMPLES, FIT_SAMPLES = 20_000, 100_000, 300_000
+# Factor on the last two for play operators: every sample moves every operator, and there are few parameters.
 PLAYS_SHARE = 0.2
 
 
@@ -50,7 +51,8 @@ def fit_multi_slope(samples: Sequence[Samples]) -> Fitted:
     """Fit the MPI model for the amplitude of the records, from rest, by unweighted least squares as published."""
     samples = [part.thinned(round(PLAYS_SHARE * FIT_SAMPLES / len(samples))) for part in samples]
     problem = Problem.pose(samples, MultiSlopeBasis.over(*_voltage_range(samples)))
-    return _solved(samples, problem, FIRST_SMOOTHNESS, [InitialState((), only_after_reset=False)] * len(samples))
+    beginnings = [InitialState((), only_after_reset=False)] * len(samples)
+    return _solved(samples, problem, FIRST_SMOOTHNESS, beginnings, fit_multi_slope)
 
 
 def _voltage_range(samples: Sequence[Samples]) -> tuple[float, float]:
@@ -63,10 +65,13 @@ def fit_linear(
     smoothness: Sequence[float] = SMOOTHNESS[:1],
     *,
     share: float = 1.0,
+    near: tuple[int, float] | None = None,
 ) -> Fitted:
     """Fit the basis, the simplest first, and the roughness weight with the lowest held-out error."""
-    # `share`, 0..1, is a factor on `SELECTION_SAMPLES` and `FIT_SAMPLES`.
-    problem, weight, beginnings = choose(samples, bases, smoothness, share=share)
+    # `share`, 0..1, is a factor on `SELECTION_SAMPLES` and `FIT_SAMPLES`; `near`, number of a basis and a weight, is
+    # tried first.
+    problem, weight, beginnings = choose(samples, bases, smoothness, share=share, near=near)
+    near = [basis is problem.basis for basis in bases].index(True), weight
     warn_of_rest(samples, beginnings)
     fitted = [
         beginning.of(part.thinned(round(share * FIT_SAMPLES / len(samples))))
@@ -77,7 +82,8 @@ def fit_linear(
         basis = problem.basis
         del problem
         problem = Problem.pose(fitted, basis).reweighted()
-    result = _solved(fitted, problem, weight, beginnings)
+    again = partial(fit_linear, bases=bases, smoothness=smoothness, share=share, near=near)
+    result = _solved(fitted, problem, weight, beginnings, again)
     judged = problem.judged[problem.weights > 0]
     warn_of_initial_history(result.errors[~judged], result.errors[judged])
     return result
@@ -92,17 +98,28 @@ class Choice(NamedTuple):
 
 
 def choose(
-    samples: Sequence[Samples], bases: Sequence[Basis], smoothness: Sequence[float], *, share: float = 1.0
+    samples: Sequence[Samples],
+    bases: Sequence[Basis],
+    smoothness: Sequence[float],
+    *,
+    share: float = 1.0,
+    near: tuple[int, float] | None = None,
 ) -> Choice:
     """Choose initial state, basis and roughness weight; parameters and errors as in `fit_linear`."""
-    thin = [part.thinned(round(share * SELECTION_SAMPLES / len(samples))) for part in samples]
     report_progress("choosing the initial state")
-    beginnings = [choose_start(part, lambda candidate: Problem.pose([candidate], bases[0])) for part in thin]
-    thin = [beginning.of(part) for beginning, part in zip(beginnings, thin, strict=True)]
-    chosen, best, lowest = None, FIRST_SMOOTHNESS if FIRST_SMOOTHNESS in smoothness else smoothness[0], np.inf
-    for number, basis in enumerate(bases, 1):
-        report_progress(f"choosing grid and smoothness, {number} of {len(bases)}")
-        problem = Problem.pose(thin, basis).reweighted()
+    beginnings = [
+        choose_start(part.thinned(START_SAMPLES // len(samples)), lambda candidate: Problem.pose([candidate], bases[0]))
+        for part in samples
+    ]
+    thin = [
+        beginning.of(part.thinned(round(share * SELECTION_SAMPLES / len(samples))))
+        for beginning, part in zip(beginnings, samples, strict=True)
+    ]
+    first, best = near or (0, FIRST_SMOOTHNESS if FIRST_SMOOTHNESS in smoothness else smoothness[0])
+    chosen, lowest = None, np.inf
+    for done, number in enumerate(sorted(range(len(bases)), key=lambda number: number != first), 1):
+        report_progress(f"choosing grid and smoothness, {done} of {len(bases)}")
+        problem = Problem.pose(thin, bases[number]).reweighted()
         better, score = problem.best_smoothness(smoothness, best, lowest)
         if chosen is None or score < lowest:
             chosen, best, lowest = problem, better, score
@@ -111,7 +128,11 @@ def choose(
 
 
 def _solved(
-    samples: Sequence[Samples], problem: Problem, smoothness: float, beginnings: Sequence[InitialState]
+    samples: Sequence[Samples],
+    problem: Problem,
+    smoothness: float,
+    beginnings: Sequence[InitialState],
+    again: Callable[[Sequence[Samples]], Fitted],
 ) -> Fitted:
     """Solve a problem whose samples begin with the initial state; return the result without that history."""
     report_progress(f"fit to {problem.count} samples")
@@ -131,6 +152,7 @@ def _solved(
         errors=problem.errors(x),
         covered=problem.basis.covered(problem.design.local[np.concatenate([part.fitted for part in samples])]),
         validate=lambda: problem.held_out_errors(smoothness, whole)[np.concatenate(recorded)],
+        again=again,
     )
 
 

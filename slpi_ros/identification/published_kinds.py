@@ -20,13 +20,13 @@ from slpi_ros.hysteresis.multi_slope import (
     rising_envelope,
     thresholds_for,
 )
-from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii, play
+from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.hysteresis.reversals import monotone_runs
 from slpi_ros.hysteresis.slpi_published import (
     Loop,
     SeparatedLoops,
     SingleLoop,
     UnidentifiedLoopWarning,
-    at_vertex,
     separate,
 )
 from slpi_ros.identification.bases import LEAST_GAIN, OperatorWeights, banded
@@ -91,6 +91,7 @@ def _fit(samples: Samples, *, at_rest: bool) -> Fitted:
         voltage_range=samples.voltage_range,
         errors=(_predict(loops, offset, samples.v) - samples.y)[samples.fitted],
         validate=lambda: held_out_errors(samples, samples.fitted & after_first_rise, predict),
+        again=fit_at_rest if at_rest else fit_primed,
         covered=len(loops.loops) / len(separate(samples.v, dead_band=loops.dead_band).loops),
     )
 
@@ -163,8 +164,8 @@ def fit_plays(
     """Fit a PI model (Eq. 8) by a quadratic program: least squares, no weight negative, the first one positive."""
     # `drive` (V) and `y` (m), shape (m,), are relative to the vertex of the loop. If `through_zero`, the displacement
     # there is 0, otherwise it is a parameter of the fit.
-    plays = [at_vertex(play(r), run_in).forward_array(drive)[used] for r in thresholds.tolist()]
-    design = np.column_stack(plays if through_zero else [*plays, np.ones(np.count_nonzero(used))])
+    plays = plays_from_vertex(drive, thresholds, run_in)[used]
+    design = plays if through_zero else np.column_stack([plays, np.ones(len(plays))])
     scale = float(np.ptp(y[used])) or 1.0
     matrix = design.T @ design
     matrix[np.diag_indices_from(matrix)] += RIDGE * float(np.trace(matrix))
@@ -176,6 +177,18 @@ def fit_plays(
     weights = np.maximum(x[: bound.size], 0.0)
     rms = float(np.sqrt(np.mean((design @ x - y[used]) ** 2)))
     return Plays(weights, 0.0 if through_zero else float(x[-1]), run_in, rms)
+
+
+def plays_from_vertex(drive: FloatArray, thresholds: FloatArray, run_in: float | None) -> FloatArray:
+    """Return the motion (V) of play operators, (m, n), along a path (V, (m,)), from their states by `at_vertex`."""
+    # Within a monotone run an operator depends on the present voltage and its state at the start of the run alone.
+    state = np.zeros(thresholds.size) if run_in is None else np.maximum(thresholds - run_in, -thresholds)
+    moved, at_vertex = np.empty((drive.size, thresholds.size)), state
+    for first, end in monotone_runs(drive):
+        v = drive[first:end, None]
+        moved[first:end] = np.maximum(v - thresholds, np.minimum(v + thresholds, state))
+        state = moved[end - 1]
+    return np.asarray(moved - at_vertex)
 
 
 class _SingleLoopFit:
@@ -367,6 +380,7 @@ def fit_amplitude_scaled(records: Sequence[Samples]) -> Fitted:
         voltage_range=samples.voltage_range,
         errors=(y - samples.y)[samples.fitted],
         validate=lambda: held_out_errors(samples, samples.fitted, predict),
+        again=fit_amplitude_scaled,
         covered=problem.basis.covered(problem.design.local[problem.weights > 0]),
     )
 

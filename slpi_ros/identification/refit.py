@@ -259,7 +259,7 @@ def _solved(problem: Problem, x_old: FloatArray, gain_spread: float = 0.0, shape
     free = solve_free(matrix + problem.penalty(FIRST_SMOOTHNESS, problem.count), vector)
     noise = white_noise(problem.design.predict(free)[problem.weights > 0] - problem.y[problem.weights > 0])
     prior = np.zeros_like(matrix)
-    prior[:size, :size] = _precision(problem.rough[:size, :size], x_old, gain_spread, shape_spread)
+    prior[:size, :size] = _precision(problem.rough[:size, :size].toarray(), x_old, gain_spread, shape_spread)
     old = np.append(x_old, np.zeros(matrix.shape[0] - size))
     return problem.program(matrix + noise**2 * prior).solve(vector + noise**2 * (prior @ old)).x
 

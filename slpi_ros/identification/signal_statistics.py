@@ -56,7 +56,8 @@ FEWEST = 100
 def digit(x: FloatArray) -> float:
     """Return the resolution of readings `x`, shape (N,), in their unit; 0 if they are continuous."""
     # The resolution is the largest step of which (nearly) all small differences between sorted readings are multiples.
-    differences = np.diff(np.unique(x[:: max(1, x.size // ENOUGH)]))
+    differences = np.diff(np.sort(x[:: max(1, x.size // ENOUGH)]))
+    differences = differences[differences > 0.0]
     if differences.size < 5:
         return 0.0
     for step in np.unique(np.quantile(differences, (0.02, 0.1, 0.25, 0.5, 0.75)))[::-1].tolist():

@@ -93,9 +93,9 @@ def metadata(folder: Path) -> tuple[list[str], dict[str, int]]:
     path = folder / "metadata.yaml"
     if not path.exists():
         return [], {}
-    with translated(folder):
-        from ruamel.yaml import YAML
+    from ruamel.yaml import YAML
 
+    with translated(folder):
         content = read_input(path, METADATA_BYTES)
         if _ALIAS.search(content):
             raise LimitError(f"{path.name} has an alias, which no recorder writes")

@@ -38,6 +38,8 @@ _MARKS = {codecs.BOM_UTF8: "utf-8", codecs.BOM_UTF16_LE: "utf-16-le", codecs.BOM
 _NO_TEXT = re.compile(r"[\0-\x08\x0e-\x19\x7f]")
 _ENOUGH = 10_000
 _BLOCK = 2**20
+# Up to 15 digits and powers of ten up to 22 are exact, and so is their quotient; with a decimal mark, one digit less.
+_LONG_NUMBER = b"0" * 16
 # Rows that pandas reads at once.
 _ROWS = 500_000
 _COMMENT = re.compile(r"^\s*(?:[#%!]|//)+\s*")
@@ -156,8 +158,9 @@ class TextTable(Table):
             return None
         marks = _DECIMAL_MARKS if self.separator != "," else _DECIMAL_MARKS[:1]
         comma = any("," in first[place] for place in places if place < len(first))
-        # With pandas 2 numbers are read to the last digit only on request; later it deprecates the request.
-        exact: dict[str, Any] = {"float_precision": "round_trip"} if int(pd.__version__.split(".")[0]) < 3 else {}
+        # With pandas 2 long numbers are read to the last digit only on request; later it deprecates the request.
+        old = int(pd.__version__.split(".")[0]) < 3
+        exact: dict[str, Any] = {"float_precision": "round_trip"} if old and self._holds_long_numbers() else {}
         for mark in reversed(marks) if comma else marks:
             try:
                 with self._open() as file, warnings.catch_warnings():
@@ -201,6 +204,20 @@ class TextTable(Table):
                 columns[places.index(place)] = seconds
             return columns[: len(places)]
         return None
+
+    def _holds_long_numbers(self) -> bool:
+        """Return whether a number may have more digits than a quotient of two exact ones, or an exponent."""
+        if self.encoding.startswith("utf-16"):
+            return True
+        marks = b"123456789." + (b"" if self.separator == "," else b",")
+        alike = bytes.maketrans(marks, b"0" * len(marks))
+        with self._open() as file:
+            end = b""
+            while block := file.read(_BLOCK):
+                if b"e" in block or b"E" in block or _LONG_NUMBER in (plain := end + block.translate(alike)):
+                    return True
+                end = plain[-len(_LONG_NUMBER) :]
+        return False
 
     def _careful(self, places: Sequence[int]) -> list[FloatArray]:
         """Read the table line by line; slower, but allows empty cells and names the line of an error."""

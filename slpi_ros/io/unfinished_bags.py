@@ -1,16 +1,16 @@
 """Bags on their way: where they lie, who writes them, and reading of what a killed recorder left."""
 
-import fcntl
 import os
 import shutil
 import sqlite3
 import struct
 from collections.abc import Iterator
-from contextlib import closing, contextmanager, suppress
+from contextlib import closing, contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 from slpi_ros.errors import RecordError
+from slpi_ros.io.file_lock import lock
 from slpi_ros.io.input_limits import BAG_BYTES, open_input
 
 # What a reader says of such a bag.
@@ -33,11 +33,9 @@ def partial_path(path: str | os.PathLike[str]) -> Path:
 def claim(partial: Path) -> int:
     """Make the folder of an unfinished bag; return a descriptor, whose lock says that its writer lives."""
     partial.mkdir(parents=True)
-    lock = os.open(partial, os.O_RDONLY)
-    # Some network file systems have no locks for folders.
-    with suppress(OSError):
-        fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    return lock
+    folder = os.open(partial, os.O_RDONLY)
+    lock(folder)
+    return folder
 
 
 def is_being_written(partial: Path) -> bool:
@@ -47,14 +45,9 @@ def is_being_written(partial: Path) -> bool:
     except OSError:
         return False
     try:
-        fcntl.flock(folder, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return True
-    except OSError:
-        return False
+        return not lock(folder, shared=True)
     finally:
         os.close(folder)
-    return False
 
 
 def abandoned_in(partial: Path) -> Path | None:

@@ -42,6 +42,8 @@ LATCHED = QoSProfile(depth=1, reliability=ReliabilityPolicy.RELIABLE, durability
 # Sensor data: only the newest message is relevant.
 MEASUREMENTS = qos_profile_sensor_data
 DIAGNOSTICS = QoSProfile(depth=10, reliability=ReliabilityPolicy.RELIABLE)
+# A node whose topics the middleware has found, but not its name: as the middleware calls it, and as it is called here.
+UNKNOWN, UNNAMED = "_NODE_NAME_UNKNOWN_", "a node of unknown name"
 # Freed memory that a process keeps: several times the size of a trajectory of a million points. Options of malloc.h.
 KEPT_BYTES, _M_TRIM_THRESHOLD, _M_MMAP_MAX = 2**29, -1, -4
 
@@ -136,7 +138,8 @@ def _change_state(node: LifecycleNode, change: Any, request: Any, response: Any)
 
 def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Timer:
     """Create a timer with a `period` (s) of a clock that neither stops, as a simulated one may, nor is set back."""
-    return node.create_timer(period, callback, clock=Clock(clock_type=ClockType.STEADY_TIME))
+    # The events executor of rclpy 9 gives a TimerInfo to a callback that could take an argument.
+    return node.create_timer(period, lambda: callback(), clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
 def reliability_of(publishers: Sequence[Any]) -> ReliabilityPolicy:
@@ -146,8 +149,8 @@ def reliability_of(publishers: Sequence[Any]) -> ReliabilityPolicy:
 
 
 def full_name(namespace: str, name: str) -> str:
-    """Return the full name of a node."""
-    return f"{namespace.rstrip('/')}/{name}"
+    """Return the full name of a node; the middleware knows the topics of a process before its names."""
+    return UNNAMED if name == UNKNOWN else f"{namespace.rstrip('/')}/{name}"
 
 
 def message_class(topic: str, msgtype: str) -> Any:
@@ -304,7 +307,9 @@ def run(make_node: Callable[[], Node], *, executor: str = "events") -> int:
         print(error, file=sys.stderr, flush=True)
         return error.exit_code
     finally:
-        try_shutdown()
+        # rclpy 9 destroys each node that is left: one that could not be made, and lacks what was not reached.
+        with suppress(AttributeError):
+            try_shutdown()
     return 0
 
 

@@ -48,14 +48,19 @@ class StateProbe:
 
 
 class Company:
-    """Who else is on the topics of a compensator: listens until its first voltage, then looks at the graph."""
+    """Who else is on the topics of a compensator, begun at a time (steady clock, ns).
 
-    def __init__(self, node: Node, controller: Controller) -> None:
+    Listens until its first voltage and for some time after that, then looks at the graph.
+    """
+
+    def __init__(self, node: Node, controller: Controller, begun_ns: int) -> None:
         self.newcomers: list[str] = []  # other publishers of the voltages that are alive, as far as is known
         self._node, self._controller, self._ownership = node, controller, controller.ownership
         self.own: set[bytes] = set()  # voltages of this node while it listens
         self._topics = {topic: node.resolve_topic_name(topic) for topic in (STATE, COMMAND)}
-        self._listening = self._ownership.listening = Listening(lambda: publishers_beside(node, self._topics[COMMAND]))
+        self._listening = self._ownership.listening = Listening(
+            lambda: publishers_beside(node, self._topics[COMMAND]), begun_ns
+        )
         self._commands: Any = None
         self._probe: StateProbe | None = None
         self._looked_ns = self._probed_ns = self._known_ns = 0  # of the graph, of the probe, when the graph was known
@@ -92,6 +97,7 @@ class Company:
         if self._commands is not None:
             self._node.destroy_subscription(self._commands)
             self._commands = None
+            self._listening.end()
             self.own.clear()
         if self._probe:
             self._probe.close()
@@ -101,7 +107,7 @@ class Company:
         """Look at the graph once a second; stop listening when a voltage has been output."""
         if self._ownership.started and self._commands is not None:
             self._controller.report((), (), now_ns)
-            if self._listening.found_all(now_ns):
+            if self._listening.may_end(now_ns, self._ownership.begun_ns):
                 self.close()
         elif not self._known_ns:
             # Whom the graph tells first is listened to from then on.

@@ -75,6 +75,8 @@ class Compensator(LifecycleNode):
     def __init__(self) -> None:
         keep_freed_memory()
         super().__init__("compensator")
+        # From now on the middleware finds others.
+        self._begun_ns = time.monotonic_ns()
         refuse_impossible_transitions(self)
         self._parameter_set = Parameters(self, DECLARATIONS, CompensatorSettings.of)
         settings = self._settings
@@ -87,7 +89,7 @@ class Compensator(LifecycleNode):
         learned_files = f"{values['memory_file']}.learned" if values["memory_file"] else ""
         self._learning = PathLearning(controller, learned_files, lambda count: self._paths.on_forgotten(count))
         self._use_learning(settings)
-        self._company = Company(self, controller)
+        self._company = Company(self, controller, self._begun_ns)
         self._reporter = Reporter(self, controller, self._learning, self._company, lambda: self._settings)
         self._memory = Memory(self, controller, values["memory_file"], self._reporter)
         self._paths = Paths(self, controller, self._learning, self._memory, self._reporter)
@@ -101,7 +103,7 @@ class Compensator(LifecycleNode):
             JointState, "stage_state", self._on_state, MEASUREMENTS, raw=True
         )
         self._mode = controller.mode  # as told last
-        self._begun_ns, self._reported_ns, self._looked_ns = time.monotonic_ns(), 0, 0
+        self._reported_ns = self._looked_ns = 0
         # A simulated clock may stop while the amplifier moves in real time.
         steady_timer(self, values["diagnostic_period"], self._on_period)
         steady_timer(self, WATCH_PERIOD, self._watch)
@@ -247,6 +249,7 @@ class Compensator(LifecycleNode):
                 self._output.publish()
         self._output.wait()
         controller.deactivate(time.monotonic_ns())
+        self._memory.poll()
         self._memory.save(complete=True)
 
     def _leave_topics(self) -> None:
@@ -340,9 +343,7 @@ class Compensator(LifecycleNode):
             self._controller.locate(time.monotonic_ns())
             self._remark_start()
         # A first message may have found the voltages before this.
-        if self._memory.waits and not ownership.obstacle:
-            self._memory.begin()
-            self._reporter.report()
+        self._memory.poll()
 
     def _remark_start(self) -> None:
         """Log what is not certain about voltages and memory where the output begins."""

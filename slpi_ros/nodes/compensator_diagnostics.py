@@ -307,11 +307,18 @@ class Reporter:
                 text = f"axis '{name}': learning is {progress.limited_by}; call ~/forget"
                 yield Problem(f"{name} learning", WARN, text)
 
+    def _known(self) -> bool:
+        """Return whether what keeps the compensator from its first voltage is known, so that it does not end soon."""
+        ownership, now_ns = self._controller.ownership, time.monotonic_ns()
+        listening = ownership.listening
+        found_out = listening is not None and listening.looks(now_ns) and listening.check(now_ns) is not None
+        return found_out or bool(ownership.identity.standing)
+
     def _ownership_problems(self) -> Iterator[Problem]:
         ownership = self._controller.ownership
         if ownership.obstacle:
-            level = WARN if ownership.armed else ERROR
-            yield Problem("" if ownership.armed else "not armed", level, ownership.obstacle[1])
+            level, kind = (WARN, "not started" if self._known() else "") if ownership.armed else (ERROR, "not armed")
+            yield Problem(kind, level, ownership.obstacle[1])
         elif not ownership.started:
             for name, note in ownership.notes.items():
                 if note:

@@ -30,7 +30,8 @@ class Memory:
     def __init__(self, node: Node, controller: Controller, path: str, reporter: Reporter) -> None:
         self._node, self._controller, self._reporter = node, controller, reporter
         self._file = MemoryFile(path) if path else None
-        self.waits = False  # for the voltages at the start, before it begins
+        self._waits = False  # for the voltages at the start, before it begins
+        self._asked = False  # for a reset that waits until it is known who else is there
         self._service = DeferredService(node, "~/reset_memory", self._on_reset)
         serve(node, "~/set_zero", self._on_set_zero)
 
@@ -44,6 +45,7 @@ class Memory:
         try:
             saved = load_memory(self._file.path)
             if saved:
+                self._controller.ownership.left = None if self._file.used else saved.last_voltages
                 saved.require_fit(model, self._controller.names)
         except SlpiError as error:
             self._node.get_logger().warning(str(error))
@@ -85,11 +87,11 @@ class Memory:
         resets, ownership = self._reporter.settings.values["reset_on_start"], controller.ownership
         if resets and ownership.listening:
             # It goes over the whole range: first everybody is found.
-            ownership.listening.thorough = True
+            ownership.left = None
             controller.locate(time.monotonic_ns())
         # As soon as the voltages are known.
-        self.waits = ownership.obstacle is not None
-        if self.waits:
+        self._waits = ownership.obstacle is not None
+        if self._waits:
             return
         if resets:
             self._start_reset()
@@ -97,6 +99,23 @@ class Memory:
         said = "; ".join(f"axis '{axis.name}' {_assumed(axis)}" for axis in unsure)
         advice = f"call {self._node.get_fully_qualified_name()}/reset_memory (~/reset_memory) to reset it"
         self._reporter.log.remark("assumed", f"the memory is assumed: {said}; {advice}, or set reset_on_start")
+
+    def poll(self) -> None:
+        """Do what has waited, as soon as it is known who else is there and where the amplifiers are."""
+        if self._asked and not self._looking:
+            self._asked = False
+            if why := self._on_reset():
+                self._service.answer(False, why)
+        if self._waits and not self._controller.ownership.obstacle:
+            self.begin()
+            self._reporter.report()
+
+    @property
+    def _looking(self) -> bool:
+        """Whether the middleware may not have found everybody yet."""
+        controller, listening = self._controller, self._controller.ownership.listening
+        waits = controller.active and controller.model is not None and not controller.ownership.started
+        return bool(waits and listening and not listening.looks(time.monotonic_ns()))
 
     # Zeros and resets
 
@@ -122,6 +141,9 @@ class Memory:
 
     def _on_reset(self) -> str:
         """Start a reset unless one is running; return the reason if this is not possible, else ""."""
+        self._asked = self._looking
+        if self._asked:
+            return ""
         if self._controller.mode is not OperatingMode.RESETTING:
             try:
                 self._start_reset()

@@ -100,8 +100,11 @@ class GuardedDrive:
         )
 
     def overdue(self) -> RecordError | None:
-        """Return the error if another node has published the topic of the voltages for longer than a killed one."""
-        return self.not_alone() if time.monotonic_ns() - self._since_ns > LEFT_NS else None
+        """Return the error if somebody else still commands or reports the stage when a killed one would have left."""
+        if time.monotonic_ns() - self._since_ns <= LEFT_NS:
+            return None
+        stranger = self.stranger()
+        return self.not_alone() or (RecordError(f"{self._node.get_name()}: {stranger}") if stranger else None)
 
     @property
     def looks(self) -> bool:

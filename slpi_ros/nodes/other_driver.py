@@ -12,13 +12,11 @@ from sensor_msgs.msg import JointState
 from slpi_ros.compensator.listening import LOOK_WITHOUT_NS, QUIET_NS
 from slpi_ros.errors import RecordError, shown
 from slpi_ros.io.stage_name import same_stage, stage_name
-from slpi_ros.nodes.common import publishers_beside
+from slpi_ros.nodes.common import UNNAMED, publishers_beside
 
 # Time to find publishers, as middleware announces itself every 3 s where what it said at first is lost, and to hear one
 # that was found: one that was killed is known for 20 s more, and silent.
 FIND, HEAR = LOOK_WITHOUT_NS * 1e-9, QUIET_NS * 1e-9
-# In names that the graph does not know yet.
-UNKNOWN = "_UNKNOWN_"
 
 
 class OtherDriver:
@@ -41,7 +39,7 @@ class OtherDriver:
         if self._found is None and (others or self.frames):
             self._found = now
         # The name of a node may become known after its publisher.
-        named = bool(others) and not any(UNKNOWN in each for each in others)
+        named = bool(others) and UNNAMED not in others
         if not (self.frames and named) and now < (self._begun + FIND if self._found is None else self._found + HEAR):
             return False
         self._node.destroy_subscription(self._subscription)

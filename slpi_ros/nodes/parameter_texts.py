@@ -58,6 +58,10 @@ def leading_zeros(arguments: Sequence[str]) -> Iterator[str]:
 
 def remedy(arguments: Sequence[str], error: str) -> str:
     """Return what to do about an `error` of ROS that parameters were given; "" if that is not known."""
+    if split := _split_list(arguments):
+        name, values = split
+        quoted = re.sub(r"(?<![\w.])[A-Za-z_]\w*", r"'\g<0>'", values)
+        return f'the shell split {name}:={values} at its spaces; quote it: -p {name}:="{quoted}"'
     kinds = error.upper()
     for where, name, text in _written(arguments):
         if "BOOL" in kinds and (word := _TRUTH.search(text)):
@@ -66,6 +70,17 @@ def remedy(arguments: Sequence[str], error: str) -> str:
         if "STRING" in kinds and name in error and _OCTAL.fullmatch(text):
             return f"{where}: a leading 0 makes it an octal number; quote it: -p {name}:=\"'{text}'\""
     return ""
+
+
+def _split_list(arguments: Sequence[str]) -> tuple[str, str] | None:
+    """Return name and text of a list that was given in several words; None without one."""
+    for k, word in enumerate(arguments):
+        name, _, text = word.partition(":=")
+        if text.startswith("[") and "]" not in text:
+            for end, last in enumerate(arguments[k:]):
+                if last.endswith("]"):
+                    return name, " ".join([text, *arguments[k + 1 : k + end + 1]])
+    return None
 
 
 def overridden(arguments: Sequence[str], node: Any) -> Iterator[str]:

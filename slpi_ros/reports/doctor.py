@@ -11,6 +11,7 @@ from slpi_ros.arrays import FloatArray
 from slpi_ros.calibration.drive_monitor import FARTHEST
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
 from slpi_ros.compensator.plausible import implausible
+from slpi_ros.identification.held_readings import held_readings
 from slpi_ros.identification.record_quality import assess, findings
 from slpi_ros.io.record import Record
 from slpi_ros.io.stage_name import same_stage, stage_name
@@ -144,7 +145,7 @@ def _of_publishers(graph: Graph) -> Iterator[Check]:
     if wrong:
         yield Check(FAILED, f"{topic}: of type {', '.join(sorted(wrong))}; publish {STATE_TYPE}")
     elif len(publishers) > 1:
-        yield Check(FAILED, f"{topic}: {len(publishers)} publishers: {', '.join(publishers)}; leave one")
+        yield Check(FAILED, f"{topic}: {len(publishers)} publishers: {', '.join(publishers)}; end all but one")
     elif not graph.stamps.size:
         yield Check(
             FAILED, f"{topic}: {', '.join(publishers)} sent nothing for {graph.seconds:.3g} s; make the driver publish"
@@ -205,8 +206,19 @@ def _of_values(graph: Graph) -> Iterator[Check]:
             yield Check(FAILED, f"{topic}: axis {axis}: {units}, {NO_STAGE}")
         else:
             yield Check(OK, f"{topic}: axis {axis} at {y * 1e6:.4g} µm, {v:.4g} V")
+            yield from _held(graph, axis)
     if not stage_name(graph.hardware_id):
         yield Check(NOTE, f"{topic}: without a hardware id in header.frame_id: models cannot be told apart by stage")
+
+
+def _held(graph: Graph, axis: str) -> Iterator[Check]:
+    """Say that the sensor of an axis is slower than the states; it only shows while the stage moves."""
+    v, y = graph.readings.get(axis, (np.empty(0), np.empty(0)))
+    known = np.isfinite(v) & np.isfinite(y)
+    held, span = held_readings(y[known], v[known]), float(np.ptp(graph.stamps))
+    if held.found and span:
+        rate = f"{(graph.stamps.size - 1) / span / held.rows:.3g} readings a second, each for {held.rows:.3g} states"
+        yield Check(NOTE, f"{graph.state_topic}: the sensor of axis {axis} is slower than the states: {rate}")
 
 
 def _units(graph: Graph, axis: str) -> str:

@@ -98,7 +98,7 @@ def test_too_few_readings_have_no_slope():
 def test_the_limits_of_a_sensor_are_parameters():
     for limits, found in ((SensorLimits(), None), (SensorLimits(following=FollowingLimits(stuck=0.6)), "stuck")):
         rule = SensorRule(10e-6, limits=limits, axis="y")
-        rule.begin(0)
+        rule.begin()
         rule.fault_time, kinds = 0.5, set()
         for k in range(1000):
             y = 5e-6 * np.sin(0.02 * k)
@@ -113,8 +113,8 @@ def test_a_sensor_is_not_judged_without_a_fault_time_or_before_it_begins():
     assert rule.check(10**12) is None
     rule.fault_time = 0.5
     assert rule.check(10**12) is None
-    rule.begin(0)
-    assert rule.check(501 * MS).kind == "silent"
+    rule.begin()
+    assert rule.check(0) is None and rule.check(501 * MS).kind == "silent"
     rule.fault_time = 0.0
     assert rule.check(10**12) is None
 

@@ -23,6 +23,7 @@ from slpi_ros.compensator.persistence import (
     MemoryFile,
     SavedAxis,
     SavedMemory,
+    is_kept,
     load_memory,
     model_id,
     read_last_voltages,
@@ -167,7 +168,13 @@ def test_last_voltages_of_other_axes_or_nowhere(tmp_path):
     last = LastVoltages(path, 1)
     last.note(as_given(5.0))
     assert read_last_voltages(path, 1, 1) == (5.0,) and read_last_voltages(path, 1, 2) is None
-    assert LastVoltages(path, 1) and read_last_voltages(path, 1, 1) is None, "a new life starts without"
+    with pytest.raises(ModelError, match=f"^{path}[^\n]+$"):
+        LastVoltages(path, 1)
+    assert is_kept(path) and read_last_voltages(path, 1, 1) == (5.0,), "one at a time keeps them"
+    last.discard()
+    assert not is_kept(path)
+    last = LastVoltages(path, 1)
+    assert read_last_voltages(path, 1, 1) is None, "a new life starts without"
     last.discard()
     assert not list(tmp_path.iterdir())
     (tmp_path / "folder.last").mkdir()
@@ -245,3 +252,19 @@ def test_a_full_disk_does_not_discard_what_this_life_has_saved(tmp_path, monkeyp
     with pytest.raises(ModelError):
         memory.save(MODEL, moved, complete=False)
     assert load_memory(path).axes["x"].reversal_voltages[-1] == 3.0
+
+
+def test_a_second_compensator_does_not_write_the_memory_of_a_running_one(tmp_path):
+    path = tmp_path / "memory.json"
+    running, second = MemoryFile(str(path)), MemoryFile(str(path))
+    running.save(MODEL, SAVED.axes, complete=False)
+    running.note(as_given(*[axis.reversal_voltages[-1] for axis in SAVED.axes.values()]))
+    before = path.read_bytes()
+    assert second.used and not running.used
+    for complete in (False, True):
+        with pytest.raises(ModelError, match=f"^{path}[^\n]+$"):
+            second.save(MODEL, {name: replace(axis, certain=False) for name, axis in SAVED.axes.items()}, complete)
+    assert path.read_bytes() == before
+    running.save(MODEL, SAVED.axes, complete=True)
+    assert not second.used
+    second.save(MODEL, SAVED.axes, complete=True)

@@ -22,7 +22,7 @@ def watched(model, reading, seconds, period=0.002):
     """Return the fault and its time (s) after 1 s of good readings; `reading` takes times and true places (m)."""
     watch, rng = SensorRule(SPAN, NOISE), np.random.default_rng(1)
     watch.fault_time = FAULT_TIME
-    watch.begin(0)
+    watch.begin()
     t = np.arange(0.0, 1.0 + seconds, period)
     true = model(t)
     told = np.where(t < 1.0, true, reading(t, true)) + rng.normal(0.0, NOISE, t.size)
@@ -142,3 +142,17 @@ def test_a_correction_at_its_limit_is_saturated_and_no_fault():
     loop.offset = -2.0
     loop.run(2.0)
     assert loop.axis.loop.state == "on" and loop.axis.loop.correction == pytest.approx(2.0, abs=0.2)
+
+
+def test_feedback_that_is_switched_on_while_nobody_sends_awaits_its_sensor_from_then_on():
+    """Counted from the last command, it was silent before the first reading."""
+    loop = Loop()
+    loop.run(1.0)
+    loop.run(1.0, lambda y, t: None)
+    assert [kind for kind, _ in loop.faults] == ["silent"]
+    loop.now_ns += 3_000 * MS
+    loop.axis.retune(LoopSettings(True, PidGains(1e6, 1e8), 0.1, LIMIT))
+    safety = Safety(0.0, False, False, (0.0,), 50.0)
+    assert not loop.made.watch(safety, FAULT_TIME, loop.now_ns)
+    assert not loop.made.watch(safety, FAULT_TIME, loop.now_ns + 499 * MS)
+    assert [found.kind for found in loop.made.watch(safety, FAULT_TIME, loop.now_ns + 500 * MS)] == ["silent"]

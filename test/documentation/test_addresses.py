@@ -32,6 +32,7 @@ TEXT = {
 HOSTS = {
     "127.0.0.1",
     "download.ros.org",
+    "fmi-standard.org",
     "github.com",
     "json-schema.org",
     "mcap.dev",

@@ -27,6 +27,8 @@ class Kind:
     address: str = "{}"  # for the driver, with that of the simulator
     terminal: bool = False  # whether it is served at a pseudo terminal
     sensor: bool = True
+    write: str = ""  # with what a write begins in what the simulator has received
+    write_answered: bool = False  # whether it has an answer of its own
 
     def simulate(self, axes: int = 1, voltages=None, **settings: Any) -> Any:
         """Return a simulator of one or two axes at these voltages (V at the stage)."""
@@ -48,13 +50,23 @@ class Kind:
 
 
 KINDS = {
-    "gcs": Kind("gcs", GcsSimulator, ("1", "2")),
-    "labjack": Kind("labjack", LabjackSimulator, ("DAC0:AIN0", "DAC1:AIN1"), gain=20.0, scale=1e-5, rounding=2e-5),
-    "tick": Kind(
-        "labjack", LabjackSimulator, ("TDAC0:AIN0:AIN2", "TDAC1:AIN1:AIN3"), gain=20.0, scale=1e-5, rounding=2e-5
+    "gcs": Kind("gcs", GcsSimulator, ("1", "2"), write="SVA "),
+    "labjack": Kind(
+        "labjack", LabjackSimulator, ("DAC0:AIN0", "DAC1:AIN1"), gain=20.0, scale=1e-5, rounding=2e-5, write="write",
+        write_answered=True,
     ),
-    "nidaqmx": Kind("nidaqmx", NidaqmxSimulator, ("ao0:ai0", "ao1:ai1"), gain=10.0, scale=1e-5),
-    "gcs at a serial port": Kind("gcs", GcsSimulator, ("1", "2"), terminal=True),
-    "nv200": Kind("serial", Nv200Simulator, ("1",), rounding=6e-4, address="nv200:{}", terminal=True),
-    "mdt": Kind("serial", MdtSimulator, ("x", "y"), rounding=0.051, address="mdt69xb:{}", terminal=True, sensor=False),
-}
+    "tick": Kind(
+        "labjack", LabjackSimulator, ("TDAC0:AIN0:AIN2", "TDAC1:AIN1:AIN3"), gain=20.0, scale=1e-5, rounding=2e-5,
+        write="write", write_answered=True,
+    ),
+    "nidaqmx": Kind(
+        "nidaqmx", NidaqmxSimulator, ("ao0:ai0", "ao1:ai1"), gain=10.0, scale=1e-5, write="WriteAnalogF64",
+        write_answered=True,
+    ),
+    "gcs at a serial port": Kind("gcs", GcsSimulator, ("1", "2"), terminal=True, write="SVA "),
+    "nv200": Kind("serial", Nv200Simulator, ("1",), rounding=6e-4, address="nv200:{}", terminal=True, write="set,"),
+    "mdt": Kind(
+        "serial", MdtSimulator, ("x", "y"), rounding=0.051, address="mdt69xb:{}", terminal=True, sensor=False,
+        write="xvoltage=",
+    ),
+}  # fmt: skip

@@ -2,6 +2,7 @@
 
 import math
 import time
+from contextlib import suppress
 
 import pytest
 from drivers.kinds import KINDS
@@ -11,6 +12,7 @@ from slpi_ros.simulation.devices.base import FAULTS, LATE, LOST, Fault
 
 # Of each driver and each link one; the others are long.
 SHORT = ("gcs", "labjack", "nidaqmx", "nv200")
+LATER = 0.6  # s: more than the drivers wait, on a busy machine too
 
 
 @pytest.fixture(
@@ -74,6 +76,51 @@ def test_a_fault_is_told_in_time_and_a_new_opening_goes_on(kind, fault):
         assert simulator.log == [] and found.setpoints == pytest.approx([20.0], abs=kind.rounding)
         assert device.write([21.0]).voltages == pytest.approx([21.0], abs=kind.rounding)
         device.close()
+
+
+def test_a_late_answer_is_not_taken_for_the_next_one(kind):
+    count = len(kind.axes)
+    with kind.simulate(count, [20.0, 10.0][:count]) as simulator:
+        device = kind.make(simulator)
+        device.open()
+        for goal in (30.0, 40.0):
+            simulator.fault = Fault(LATE, seconds=LATER)
+            with pytest.raises(DeviceError):
+                device.read()
+            for axis, volts in zip(simulator.axes, (goal, goal + 5.0), strict=False):
+                simulator.set_by_hand(axis, volts / kind.gain)
+            # What came late may meet the next opening, too.
+            for _ in range(200):
+                with suppress(DeviceError):
+                    device.open()
+                    break
+            for _ in range(5):
+                reading = device.read()
+                assert reading.voltages == pytest.approx(kind.volts(simulator), abs=kind.rounding)
+                if kind.sensor:
+                    assert reading.positions == pytest.approx(simulator.move(), abs=1e-7)
+        device.close()
+
+
+def test_a_write_whose_answer_is_late_is_carried_out_once(kind):
+    with kind.simulate(voltages=[20.0]) as simulator:
+        device = kind.make(simulator)
+        device.open()
+        simulator.fault = Fault(LATE, kind.write if kind.write_answered else "", seconds=LATER)
+        with pytest.raises(DeviceError):
+            device.write([21.0])
+        # A second one would undo this.
+        while simulator.voltage(simulator.axes[0]) == pytest.approx(20.0 / kind.gain, abs=kind.rounding):
+            time.sleep(0.01)
+        simulator.set_by_hand(simulator.axes[0], 30.0 / kind.gain)
+        for _ in range(200):
+            with suppress(DeviceError):
+                found = device.open()
+                break
+        device.close()
+        assert found.setpoints == pytest.approx([30.0], abs=kind.rounding)
+        assert [kind.gain * each.voltage for each in simulator.log] == pytest.approx([21.0, 30.0], abs=kind.rounding)
+        assert len([each for each in simulator.received if each.startswith(kind.write)]) == 1
 
 
 def test_beyond_its_own_range_it_refuses(kind):

@@ -112,3 +112,24 @@ def test_it_is_told_and_judged_at_the_rate_of_the_sensor():
     assert rows == pytest.approx(4.0, rel=0.01) and np.isnan(fresh.displacement["x"]).mean() == pytest.approx(
         0.75, abs=0.01
     )
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("jitter", [False, True])
+@pytest.mark.parametrize("digits", [1e-9, 1e-8])
+@pytest.mark.parametrize(("rate", "seconds", "speed"), [(1000, 10.0, 120.0), (10_000, 2.0, 300.0)])
+def test_the_error_on_a_clean_record_is_that_of_the_fresh_readings(rate, seconds, speed, digits, jitter):
+    rng = np.random.default_rng(11)
+    t, v = drive(rng, rate, seconds, speed)
+    other_t, other_v = drive(np.random.default_rng(12), 1000, 10.0)
+    clean = Memory(STAGE, 0.0).forward_array(other_v)
+
+    def error(y):
+        model = slpi_ros.identify(record(t, v, y), kind="pi")
+        return np.std(np.ravel(model.simulate(other_t, other_v)) - clean)
+
+    y = readings(rng, v, 8e-9, digits)
+    # Two rows of 10 kHz within one digit of 10 nm are not told from fresh ones.
+    for rows in (1, 2, 3, 5, 10, 20) if jitter or rate * digits < 1e-4 else (1, 3, 5, 10, 20):
+        shown, new = held(rng, y, rows, jitter) if rows > 1 else (y, np.ones(y.size, dtype=bool))
+        assert error(shown) <= 1.1 * error(np.where(new, shown, np.nan)), rows

@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import scipy.sparse as sp
 from identification.records import record_of
 
 from slpi_ros.excitation.drives import calibration_drive
+from slpi_ros.identification import least_squares
 from slpi_ros.identification.fit import identify
 from slpi_ros.identification.least_squares import Problem
 from slpi_ros.identification.linear_kinds import SMOOTHNESS, surfaces
@@ -71,6 +73,20 @@ def test_held_out_errors_are_those_of_fits_to_the_other_samples():
         x = replace(problem, weights=weights).solve(0.1).x
         expected = (problem.design.predict(x) - problem.y)[fold.chosen] * problem.scale
         np.testing.assert_allclose(errors[fold.chosen], expected, atol=1e-6 * problem.scale)
+
+
+def test_sparse_factors_give_the_same_fits(monkeypatch):
+    record = recorded(5, 0.05)
+    dense, others = posed(record, 2), posed(record, 2)
+    monkeypatch.setattr(least_squares, "SPARSE_FROM", 100)
+    sparse = posed(record, 2)
+    np.testing.assert_allclose(sparse.residual(), others.residual(), atol=1e-9)
+    assert all(isinstance(fold.matrix, sp.csc_array) for fold in sparse.folds)
+    whole = dense.solve(0.3)
+    errors = (problem.held_out_errors(0.3, whole) for problem in (sparse, dense))
+    np.testing.assert_allclose(*errors, atol=1e-9 * dense.scale)
+    monkeypatch.undo()
+    np.testing.assert_allclose(sparse.score(0.3), others.score(0.3), rtol=1e-9)
 
 
 def test_an_identification_that_is_repeated_gives_the_same_document():

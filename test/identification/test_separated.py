@@ -8,10 +8,10 @@ import pytest
 from identification.records import record_of, rms
 
 from slpi_ros.errors import IdentificationError, UsageError
-from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
-from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop, separate
+from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii, play
+from slpi_ros.hysteresis.slpi_published import SeparatedLoops, SingleLoop, at_vertex, separate
 from slpi_ros.identification.fit import identify
-from slpi_ros.identification.published_kinds import default_thresholds
+from slpi_ros.identification.published_kinds import default_thresholds, plays_from_vertex
 from slpi_ros.model.document import format_model, parse_model
 from slpi_ros.papers.slpi_exhibits import least_iterations
 from slpi_ros.simulation.axis import SimulatedAxis
@@ -38,6 +38,15 @@ def stage_record(parameters=None):
     stage = SimulatedAxis(parameters or AxisParameters(stroke=24e-6), 0)
     t = 0.1 * np.arange(PATH.size)
     return record_of(t, PATH, stage.run(t, PATH)[0])
+
+
+@pytest.mark.parametrize("run_in", [None, 0.0, 5.0, 20.0, 45.0])
+@pytest.mark.parametrize("seed", range(3))
+def test_play_operators_move_as_those_of_the_model(seed, run_in):
+    drive = np.append(0.0, np.repeat(np.abs(np.cumsum(np.random.default_rng(seed).normal(0.0, 8.0, 60))), 2))
+    moved = plays_from_vertex(drive, THRESHOLDS, run_in)
+    expected = [at_vertex(play(r), run_in).forward_array(drive) for r in THRESHOLDS]
+    np.testing.assert_allclose(moved, np.column_stack(expected), atol=1e-12)
 
 
 def test_recovers_the_weights_of_every_loop():

@@ -163,3 +163,13 @@ def test_any_bytes_are_read_or_refused(tmp_path_factory, junk):
     path.write_bytes(junk)
     with pytest.raises(RecordError):
         import_table(path)
+
+
+@pytest.mark.parametrize("digits", range(0, 17, 2))
+def test_numbers_are_read_to_their_last_digit(tmp_path, digits):
+    texts = [f"{value:.{digits}f}" for value in np.random.default_rng(digits).normal(0.0, 1e3, 2000).tolist()]
+    path = tmp_path / "table.csv"
+    for separator, mark in ((",", "."), (";", ",")):
+        rows = (f"{k}{separator}{text.replace('.', mark)}\n" for k, text in enumerate(texts))
+        path.write_text(f"a{separator}b\n{''.join(rows)}")
+        assert load_text(path).read(["b"])["b"].tolist() == [float(text) for text in texts]

@@ -9,6 +9,7 @@ from nodes.compensator_client import compensator
 from nodes.ros_helpers import RELIABLE, NodeProcess, stage_model
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
+from std_srvs.srv import Trigger
 
 from slpi_ros.model.document import save_model
 
@@ -56,6 +57,7 @@ def test_a_model_of_another_stage_moves_nothing(model_file):
     with compensator(model_file=model_file, start_voltage="auto") as client:
         reporting(client, frame="theirs")
         wait_for_obstacle(client, "'mine'", "'theirs'")
+        client.graph.spin_until(lambda: "'theirs'" in client.node.stderr, "that it is told without a command")
         assert insist(client, 2.0) == 0
 
 
@@ -115,6 +117,7 @@ def test_a_second_compensator_does_not_move_beside_a_running_one(model_file):
             client.graph.wait_for_status(
                 "/second: compensator", lambda status: "/compensator" in status.message, "the running one named"
             )
+            client.graph.spin_until(lambda: "/compensator" in second.stderr, "that it is told without a command")
             client.graph.spin_for(3.0)
             # The running one repeats its voltage; nothing else has moved.
             assert {answer[0] for answer in client.answers[-3:]} == {client.answers[-1][0]}
@@ -128,3 +131,20 @@ def test_a_second_compensator_does_not_move_beside_a_running_one(model_file):
             client.graph.spin_until(lambda: client.answered > last + 3, "its reset")
         finally:
             second.stop(signal.SIGKILL)
+
+
+def reset(client):
+    return client.graph.call(Trigger, f"{client.name}/reset_memory", Trigger.Request())
+
+
+def test_a_reset_that_is_asked_for_at_once_waits_until_it_is_known_who_is_there(model_file):
+    with compensator(model_file=model_file, start_voltage="auto", reset_rate=500.0) as client:
+        reporting(client)
+        assert reset(client).success and client.answered > 3
+
+
+def test_a_reset_of_another_stage_is_refused(model_file):
+    with compensator(model_file=model_file, start_voltage="auto") as client:
+        reporting(client, frame="theirs")
+        answer = reset(client)
+        assert not answer.success and "'theirs'" in answer.message and client.answered == 0

@@ -334,6 +334,21 @@ def test_it_drives_nothing_beside_another_publisher():
     assert not listener.commands
 
 
+@pytest.mark.slow
+def test_it_drives_nothing_beside_two_reporters_of_an_axis():
+    with on_graph() as graph:
+        for _ in range(2):
+            publish = graph.node.create_publisher(JointState, "stage_state", RELIABLE).publish
+            graph.node.create_timer(
+                0.01, lambda publish=publish: publish(JointState(name=["x"], position=[0.0], effort=[0.0]))
+            )
+        listener = Listener(graph)
+        with exciter(graph, **LIMITS, settle=0.0) as node:
+            assert wait_for_end(graph, node) == 1
+            assert holds(node.stderr.splitlines()[-1], "two publishers of stage_state")
+    assert not listener.commands
+
+
 def test_it_returns_when_another_publisher_appears():
     with on_graph() as graph, exciter(graph, **AT_ONCE, duration=30.0, slew_limit=400.0) as node:
         listener = Listener(graph)

@@ -10,6 +10,7 @@ from nodes.ros_helpers import on_graph, started  # noqa: E402
 from std_msgs.msg import Float64MultiArray  # noqa: E402
 
 from slpi_ros.cli import main  # noqa: E402
+from slpi_ros.nodes.common import UNNAMED, full_name  # noqa: E402
 from slpi_ros.nodes.graph_probe import probe  # noqa: E402
 from slpi_ros.reports.doctor import FAILED, check_graph  # noqa: E402
 
@@ -53,3 +54,8 @@ def test_a_name_that_ros_refuses_is_wrong_usage(capsys):
     assert main(["doctor", "--seconds", "0.1", "--namespace", "1 2"]) == 2
     said = capsys.readouterr()
     assert not said.out and said.err.count("\n") == 1
+
+
+def test_a_node_whose_name_the_middleware_does_not_know_yet_is_told_in_words():
+    assert full_name("/lab", "driver") == "/lab/driver"
+    assert full_name("_NODE_NAMESPACE_UNKNOWN_", "_NODE_NAME_UNKNOWN_") == UNNAMED

@@ -44,6 +44,9 @@ def test_options_that_are_none_of_ros_are_left_alone():
 
 
 def test_another_error_is_left_as_it_is():
+    split = remedy(["--ros-args", "-p", "axes:=[x,", "y]", "-p", "seed:=1"], "Couldn't parse parameter override rule")
+    assert split.endswith("-p axes:=\"['x', 'y']\"")
+    assert remedy(["--ros-args", "-p", "top:=[1.0,", "2e3]"], "Couldn't parse").endswith('-p top:="[1.0, 2e3]"')
     assert remedy(["--ros-args", "-p", "seed:=soon"], "seed is of type STRING, expecting INTEGER") == ""
 
 

@@ -76,6 +76,14 @@ def test_every_fault_of_a_graph_is_to_be_mended(model, name):
     assert told in text
 
 
+@pytest.mark.parametrize("rows", [1, 5])
+def test_a_sensor_that_is_slower_than_the_states_is_told(rows):
+    v = 50.0 - 50.0 * np.cos(np.arange(600) / 60)
+    y = (2e-7 * v + NOISE)[np.arange(600) // rows * rows]
+    told = [check.text for check in check_graph(graph(readings={"x": (v, y)})) if "slower" in check.text]
+    assert len(told) == (rows > 1) and all("40 readings" in text for text in told)
+
+
 def test_a_model_on_the_graph_is_compared_unless_another_is_given(model):
     other = replace(model, hardware_id="s2")
     assert to_mend(check_graph(graph(model=other))) and not to_mend(check_graph(graph(model=other), model))

@@ -3,12 +3,15 @@
 Each stage (Preisach hysteresis, a mode of 60 to 600 Hz with a damping of 0.005 to 0.5, 0.2 to 5 ms of delay, sensor and
 loop at six times the mode to 5 kHz) is identified and diagnosed from two records, its frequency response measured in a
 third, `slpi_ros.compensator.loop_design` makes the gains, and the compensator's controller closes the loop on the
-stage. Sensitivity is measured with a multisine on the reading. Today's rule is ``ki g = min(2 d w / 5, 0.2 / delay)``
-with the true numbers; its bandwidth is that of the linear loop with the slope that the tuned loop has shown.
+stage, whose voltage is held between its outputs. Sensitivity is measured with one sine on the reading after the other:
+of a multisine the hysteresis makes distortion at all frequencies, and the mode magnifies it. Today's rule is
+``ki g = min(2 d w / 5, 0.2 / delay)`` with the true numbers; its bandwidth is that of the linear loop with the slope
+that the tuned loop has shown.
 """
 
 import argparse
 import time
+from collections import deque
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
@@ -18,7 +21,7 @@ import numpy as np
 
 from slpi_ros.compensator.controller import Controller
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
-from slpi_ros.compensator.loop_design import HALF, Loop, Shape, design
+from slpi_ros.compensator.loop_design import HALF, Design, Loop, Shape, design
 from slpi_ros.compensator.loop_margin import DiscreteLoop
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.diagnosis.diagnose import diagnose
@@ -40,10 +43,13 @@ from slpi_ros.workflows.tune import beside_model
 
 BEGIN_NS, SECOND_NS = 10**12, 10**9
 LIMITS = Limits(0.0, 100.0)
-# Samples of the records, and least time (s); rms of the multisine, and size of the raster (shares of the stroke), with
+# Samples of the records, and least time (s); rms of added signals, and size of the raster (shares of the stroke), with
 # its frequency (Hz), and seconds. Time of the record of the response (s).
 RESPONSE = 12.0
-SAMPLES, SHORTEST, MULTISINE, RASTER = 14_000, 3.0, 0.01, (0.3, 5.0, 2.0)
+SAMPLES, SHORTEST, ADDED, RASTER = 14_000, 3.0, 0.01, (0.3, 5.0, 2.0)
+# Sines: number from end to end, beside the mode and beside the largest; decays of the mode before each is measured,
+# then seconds, and least periods.
+SINES, SETTLED, LASTING, PERIODS = (25, 21, 9), 6.0, 0.3, 4
 Signal = Callable[[float], float]
 
 
@@ -114,9 +120,15 @@ class Stage:
         made.activate(BEGIN_NS)
         v = made.axes[0].output.voltage
         begin_ns = BEGIN_NS // period_ns * period_ns + 10 * period_ns
-        true, readings = [], []
+        true, readings, delay_ns = [], [], round(self.character.delay * SECOND_NS)
+        arriving: deque[int] = deque()
 
         def moved(at_ns: int) -> float:
+            # The stage takes its input as linear between two steps: it steps before and after what arrives late.
+            while arriving and arriving[0] <= at_ns:
+                arrives_ns = arriving.popleft()
+                for before in (1, 0):
+                    axis.step((arrives_ns - before - begin_ns) * 1e-9 + 1.0, v)
             return axis.step((at_ns - begin_ns) * 1e-9 + 1.0, v)
 
         for k in range(round(seconds * self.rate)):
@@ -128,6 +140,7 @@ class Stage:
                 moved(now_ns)
                 v = made.axes[0].output.voltage
                 moved(now_ns)
+                arriving.append(now_ns + delay_ns)
             at_ns = now_ns + period_ns // 50
             x = moved(at_ns)
             y = (axis.measure(x) if noise else x) + (float(added[k % added.size]) if added.size else 0.0)
@@ -147,16 +160,53 @@ def multisine(size: int, rms: float, rng: np.random.Generator) -> np.ndarray:
     return np.asarray(signal * rms / signal.std())
 
 
-def sensitivity(stage: Stage, model: AxisModel, gains: PidGains, middle: float) -> tuple[np.ndarray, np.ndarray]:
+def sines(
+    stage: Stage, model: AxisModel, gains: PidGains, frequencies: np.ndarray, middle: float, peak: float
+) -> np.ndarray:
+    """Return the sensitivity, complex, (K,), at frequencies (Hz), (K,), measured with one sine (m) after the other."""
+    ring = 1.0 / (2.0 * pi * stage.character.damping * stage.character.resonance)
+    added, windows, count = [], [], 0
+    for f in frequencies:
+        settling = round(max(SETTLED * ring, 3.0 / f, 0.05) * stage.rate)
+        size = settling + round(max(round(LASTING * f), PERIODS) / f * stage.rate)
+        added.append(peak * np.sin(2.0 * pi * f / stage.rate * np.arange(size)))
+        windows.append(slice(count + settling, count + size))
+        count += size
+    given = np.concatenate(added)
+    _, y = stage.closed(model, gains, count / stage.rate, lambda t: middle, given, False, 1.0)
+    found = []
+    for f, window in zip(frequencies, windows, strict=True):
+        k = np.arange(window.stop - window.start)
+        phase = 2.0 * pi * f / stage.rate * k
+        basis = np.stack([np.sin(phase), np.cos(phase), np.ones(k.size), k / k.size], axis=1)
+        of = [np.linalg.lstsq(basis, signal[window], rcond=None)[0] for signal in (y, given)]
+        found.append(complex(*of[0][:2]) / complex(*of[1][:2]))
+    return np.array(found)
+
+
+def sensitivity(stage: Stage, model: AxisModel, tuned: Design, middle: float) -> tuple[np.ndarray, np.ndarray]:
     """Return frequencies (Hz) and sensitivity, complex, (K,) each, of the loop on the stage at rest."""
-    size, periods = int(2.0 * stage.rate), 3
-    added = multisine(size, MULTISINE * float(np.ptp(model.displacement_range)), np.random.default_rng(stage.seed))
-    _, y = stage.closed(model, gains, periods * size / stage.rate, lambda t: middle, added, False, 1.0)
-    last = y[-size:] - y[-size:].mean()
-    begin = (y.size - size) % size
-    return np.arange(1, size // 2) * stage.rate / size, (
-        np.fft.rfft(last)[1 : size // 2] / np.fft.rfft(np.roll(added, -begin))[1 : size // 2]
-    )
+    mode, highest = stage.character.resonance, 0.45 * stage.rate
+    peak = ADDED * 2.0**0.5 * float(np.ptp(model.displacement_range))
+    whole, beside, refined = SINES
+    around = mode * np.linspace(0.85, 1.15, beside)
+    f = np.geomspace(min(0.25 * tuned.bandwidth, 0.8 * mode), min(5.0 * mode, highest), whole)
+    f = np.union1d(f, around[around <= highest])
+    s = sines(stage, model, tuned.gains, f, middle, peak)
+    most = int(np.argmax(np.abs(s)))
+    more = np.linspace(f[max(most - 1, 0)], f[min(most + 1, f.size - 1)], refined + 2)[1:-1]
+    more = np.setdiff1d(more, f)
+    order = np.argsort(np.concatenate([f, more]))
+    s = np.concatenate([s, sines(stage, model, tuned.gains, more, middle, peak)])[order]
+    return np.concatenate([f, more])[order], s
+
+
+def first_reached(f: np.ndarray, size: np.ndarray, level: float) -> float:
+    """Return the lowest frequency (Hz) at which a size, (K,), at frequencies, (K,), reaches a level."""
+    k = int(np.argmax(size >= level))
+    if not k:
+        return float(f[0])
+    return float(np.exp(np.interp(log(level), np.log(size[k - 1 : k + 1]), np.log(f[k - 1 : k + 1]))))
 
 
 def judged(seed: int) -> dict[str, float]:
@@ -168,13 +218,12 @@ def judged(seed: int) -> dict[str, float]:
     made = time.process_time()
     low, high = model.displacement_range
     middle, stroke = 0.5 * (low + high), high - low
-    f, s = sensitivity(stage, model, tuned.gains, middle)
+    f, s = sensitivity(stage, model, tuned, middle)
     size = np.abs(s)
-    reached = np.flatnonzero(size >= HALF)
-    bandwidth = float(f[reached[0]])
+    bandwidth = first_reached(f, size, HALF)
     # The slope that the stage has shown: of the return ratio where it is large.
     linear = DiscreteLoop(tuned.plant, tuned.gains, 1.0 / stage.rate)
-    slow = (f >= 0.1 * bandwidth) & (f <= 0.5 * bandwidth)
+    slow = f <= bandwidth
     back = 1.0 / s[slow] - 1.0
     slope = tuned.plant.slope * float(np.median(np.abs(back) / np.abs(linear.response(2.0 * pi * f[slow]))))
     character = stage.character
@@ -202,7 +251,7 @@ def judged(seed: int) -> dict[str, float]:
         error = x - np.array([path(each) for each in t])
         errors.append(float(np.sqrt(np.mean(error[t >= 1.0] ** 2))))
     stable = 0
-    added = multisine(int(0.5 * stage.rate), MULTISINE * stroke, np.random.default_rng(1))
+    added = multisine(int(0.5 * stage.rate), ADDED * stroke, np.random.default_rng(1))
     for scale in (0.9, 1.1):
         _, y = stage.closed(model, tuned.gains, 2.0, lambda t: middle, added, False, scale)
         parts = [float(np.ptp(part)) for part in np.array_split(y[y.size // 4 :], 3)]

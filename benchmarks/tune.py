@@ -22,7 +22,7 @@ import numpy as np
 from slpi_ros.compensator.controller import Controller
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
 from slpi_ros.compensator.loop_design import HALF, Design, Loop, Shape, design
-from slpi_ros.compensator.loop_margin import DiscreteLoop
+from slpi_ros.compensator.loop_margin import DiscreteLoop, Plant
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.diagnosis.diagnose import diagnose
 from slpi_ros.effects.delay import Delay
@@ -78,10 +78,17 @@ class Stage:
         rate = between(6.0 * mode, 5000.0)
         return cls(AxisParameters.random(int(rng.integers(2**31))), character, rate, seed)
 
+    def driven(self, seed: int, t: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """Return readings (m) at times (s) of voltages (V) that are linear between them, (N,) each."""
+        # Also where a delayed voltage has its corners: between two steps the stage takes its input as linear.
+        every = np.union1d(t, t + self.character.delay)
+        _, y = SimulatedAxis(self.parameters, seed, self.character).run(every, np.interp(every, t, v))
+        return np.asarray(y[np.searchsorted(every, t)])
+
     def measured(self) -> FrequencyResponse:
         """Return the frequency response, of the drive for it."""
         drive = response_drive(("x",), 0.0, 100.0, 800.0, RESPONSE, self.rate, self.seed)
-        _, y = SimulatedAxis(self.parameters, 2, self.character).run(drive.t, drive.voltage["x"])
+        y = self.driven(2, drive.t, drive.voltage["x"])
         return frequency_response(drive.t, drive.voltage["x"], y)
 
     def identified(self) -> AxisModel:
@@ -94,7 +101,7 @@ class Stage:
                 duration=max(share * SAMPLES / self.rate, SHORTEST), seed=self.seed, drive=drive,
             )  # fmt: skip
             v = voltages.voltage["x"]
-            _, y = SimulatedAxis(self.parameters, number, self.character).run(voltages.t, v)
+            y = self.driven(number, voltages.t, v)
             stamps = (voltages.t * SECOND_NS).astype(np.int64) + number * 10**12
             records.append(Record(stamps, {"x": v}, {"x": y}, f"record {number}"))
         return diagnose(records, identify(records[0])).extended.axis("x")
@@ -265,12 +272,48 @@ def judged(seed: int) -> dict[str, float]:
     }  # fmt: skip
 
 
+def response_judged(stage: Stage) -> tuple[int, float, float, float]:
+    """Return lines up to twice the mode, shares with an interval of 5 %, of these within 5 % and 5 degrees, in theirs.
+
+    The truth is mode and delay; the slope, which depends on the amplitude, is the measured one.
+    """
+    found, character = stage.measured(), stage.character
+    mode = Resonance((Mode(character.resonance, character.damping, 1.0),))
+    truth = Plant(1.0, character.delay, mode.dynamics).response(2.0 * pi * found.frequency)
+    off = found.response / truth
+    off = off / np.median(np.abs(off[found.frequency < 0.5 * character.resonance]))
+    band = found.frequency <= 2.0 * character.resonance
+    sure = band & (found.relative <= 0.05)
+    within = (np.abs(np.abs(off) - 1.0) <= 0.05) & (np.abs(np.angle(off)) <= np.radians(5.0))
+    inside = np.abs(off - 1.0) <= found.relative
+    return (
+        int(np.sum(band)), float(np.sum(sure) / np.sum(band)),
+        float(np.mean(within[sure])) if sure.any() else 1.0, float(np.mean(inside[band])),
+    )  # fmt: skip
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     """Print each stage and the counts."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=30)
     parser.add_argument("--first", type=int, default=0, help="first seed")
+    parser.add_argument("--response", action="store_true", help="the frequency responses only")
     options = parser.parse_args(arguments)
+    if options.response:
+        print(
+            " seed  mode/Hz damping | lines to twice the mode, sure within 5 %, of these right, inside their interval"
+        )
+        shares = []
+        for seed in range(options.first, options.first + options.count):
+            stage = Stage.drawn(seed)
+            lines, sure, right, inside = response_judged(stage)
+            shares.append(right)
+            c = stage.character
+            print(f"{seed:5d} {c.resonance:8.0f} {c.damping:7.3f} | {lines:5d} {sure:7.1%} {right:7.1%} {inside:7.1%}")
+        print(
+            f"all sure lines right: {np.sum(np.array(shares) == 1.0)}, 95 % of them: {np.sum(np.array(shares) >= 0.95)}"
+        )
+        return 0
     print(
         " seed  mode/Hz damping delay/ms rate/Hz | bandwidth/Hz (predicted) over today's rule, margin, stable of 2 | "
         "raster, nm rms: feedforward, today's rule, tuned", flush=True,

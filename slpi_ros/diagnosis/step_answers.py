@@ -45,14 +45,16 @@ class StepAnswer:
 
 def step_answers(t: FloatArray, desired: FloatArray, error: FloatArray, noise_rms: float) -> tuple[StepAnswer, ...]:
     """Return the answers to steps, by rising size, for desired displacement and error (m), at times (s), (N,) each."""
-    jumps = np.flatnonzero(np.diff(desired)) + 1
-    edges = np.concatenate([[0], jumps, [t.size]])
-    held = np.diff(edges) >= HELD
+    edges = np.concatenate([[0], np.flatnonzero(np.diff(desired)) + 1, [t.size]])
+    held = np.flatnonzero(np.diff(edges) >= HELD)
+    begins, ends = edges[held], edges[held + 1]
     found: list[tuple[float, float, float | None, float | None]] = []
-    for k in np.flatnonzero(held[1:] & held[:-1]):
-        at = slice(int(edges[k + 1]), int(edges[k + 2]))
-        step = float(desired[at.start] - desired[at.start - 1])
-        left, passed = median_filter(error[at], MEDIAN, mode="nearest"), t[at] - t[at.start]
+    # A set point that is read between two messages moves within a few samples.
+    for k in np.flatnonzero(begins[1:] - ends[:-1] < HELD):
+        at, to = slice(int(ends[k]), int(ends[k + 1])), float(desired[begins[k + 1]])
+        step = to - float(desired[at.start - 1])
+        left = median_filter(error[at] + desired[at] - to, MEDIAN, mode="nearest")
+        passed = t[at] - t[at.start]
         settled, quiet = (_after(passed, left, limit) for limit in (SETTLED * abs(step), NOISES * noise_rms))
         found.append((abs(step), max(float(np.max(left * np.sign(step))), 0.0) / abs(step), settled, quiet))
     found.sort(key=lambda each: each[0])

@@ -395,11 +395,11 @@ def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
             some = thin_line(part)
             chart.line(1, cause, t[some], part[some], COLOUR[cause], width=1.0)
     said = views.focus(chart, (1,), [error])
-    _show_steps(page, name, tracking.steps)
+    show_steps(page, name, tracking.steps)
     page.chart(f"{name}-tracking", chart, f"Desired and measured displacement, and the parts of the error. {said}")
 
 
-def _show_steps(page: Page, name: str, steps: Sequence[StepAnswer]) -> None:
+def show_steps(page: Page, name: str, steps: Sequence[StepAnswer]) -> None:
     """Add how steps of the path settle, by their size."""
     if not steps:
         return

@@ -49,6 +49,11 @@ class FrequencyResponse:
         """`interval` over the magnitude, (K,)."""
         return np.asarray(self.interval / np.maximum(np.abs(self.response), 1e-300))
 
+    @property
+    def slope(self) -> float:
+        """Magnitude at the lowest frequencies, m/V."""
+        return float(np.median(np.abs(self.response[: max(3, self.frequency.size // 20)])))
+
     def agreement(self, model: ComplexArray, within: float = 0.1) -> tuple[float, float] | None:
         """Return the band (Hz) from the lowest frequency on in which a model (m/V, (K,)) has this shape; None: none.
 

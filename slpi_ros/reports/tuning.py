@@ -13,15 +13,17 @@ from slpi_ros.errors import length
 from slpi_ros.identification.frequency_response import FrequencyResponse
 from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.reports.chart import AFTER, DESIRED, MEASURED, NOISE, TIME, Chart, Panel, Quantity
+from slpi_ros.reports.chart import AFTER, BEFORE, DESIRED, MEASURED, NOISE, TIME, Chart, Panel, Quantity
 from slpi_ros.reports.page import Page
 
 FILES = ("report.html",)
 FREQUENCY = Quantity("frequency", "Hz", digits=".4~g", logarithmic=True)
 RESPONSE = Quantity("reading over voltage", "nm/V", 1e9, ".4~g", logarithmic=True)
 PHASE = Quantity("phase", "degrees", 180.0 / pi, ".1f")
-SENSITIVITY = Quantity("error with feedback over without", "", digits=".3~g", logarithmic=True)
+SENSITIVITY = Quantity("sensitivity |S|", "", digits=".3~g", logarithmic=True)
 REST = Quantity("error", "% of the step", 100.0, ".2f")
+# Colour of the band in which model and measurement agree.
+AGREE = "#eef4f1"
 # Points of a curve over frequency.
 POINTS = 1500
 HELP = {
@@ -56,10 +58,8 @@ def describe_measured(found: Design, measured: FrequencyResponse | None) -> list
     model = found.plant.response(2.0 * pi * measured.frequency)
     band = measured.agreement(model)
     where = f"agree from {band[0]:.3g} to {band[1]:.4g} Hz" if band else "agree nowhere"
-    low = slice(0, max(3, measured.frequency.size // 20))
-    slope = float(np.median(np.abs(measured.response[low])))
     return [
-        f"measured and modelled response {where}, but for the slope: {slope * 1e9:.3g} nm/V of small motions, "
+        f"measured and modelled response {where}, but for the slope: {measured.slope * 1e9:.3g} nm/V of small motions, "
         f"{found.plant.slope * 1e9:.3g} nm/V of the largest loop; in the design both are used"
     ]
 
@@ -141,8 +141,14 @@ def write_files(
     page.write(folder / FILES[0])
 
 
-def _show_measured(bode: Chart, measured: FrequencyResponse) -> None:
-    """Add what was measured, with its interval of 95 %."""
+def _show_measured(bode: Chart, found: Design, measured: FrequencyResponse) -> None:
+    """Add what was measured, with its interval of 95 %, and the model with its slope where both agree."""
+    model = found.plant.response(2.0 * pi * measured.frequency)
+    shown = np.abs(model) * measured.slope / found.plant.slope
+    bode.line(0, "model, small motions", measured.frequency, shown, BEFORE, width=1.4)
+    if band := measured.agreement(model):
+        for panel in (0, 1):
+            bode.span(panel, "agree", *band, AGREE)
     size, half = np.abs(measured.response), measured.interval
     sure = half < size
     for edge in (size + half, size - half):
@@ -157,7 +163,7 @@ def _show(page: Page, name: str, axis: AxisModel, found: Design, measured: Frequ
     frequency = np.geomspace(max(1e-2 * found.bandwidth, 1e-6), 0.5 / found.period, POINTS)
     frequency = np.unique(np.concatenate([frequency, loop.omega[loop.omega > 2.0 * pi * frequency[0]] / (2.0 * pi)]))
     omega = 2.0 * pi * frequency
-    bode = Chart([Panel(FREQUENCY, RESPONSE, 2.0), Panel(FREQUENCY, PHASE)], "column", 520)
+    bode = Chart([Panel(FREQUENCY, RESPONSE, 1.6), Panel(FREQUENCY, PHASE)], "column", 560)
     corners = (loop.corners[0], loop.corners[-1]) if loop.modes else ()
     for each, label, colour, width in (
         *((corner, f"the mode {DETUNING:.0%} off", MEASURED, 1.0) for corner in corners),
@@ -168,14 +174,14 @@ def _show(page: Page, name: str, axis: AxisModel, found: Design, measured: Frequ
         if each is loop.nominal:
             bode.line(1, label, frequency, np.unwrap(np.angle(response)), colour, width=width)
     if measured:
-        _show_measured(bode, measured)
+        _show_measured(bode, found, measured)
     page.section("What the stage does: a small sine of the voltage, seen by the sensor")
     page.chart(
         f"bode-{name}", bode,
         "How many nanometres the reading moves for each volt, and by how much it is late (360 degrees: a whole "
         "period). A peak is a mode: there the stage rings, and the notch takes the feedback out. Grey: that mode 10 % "
-        "lower and higher, with which the loop keeps its margin, too. Dots are measured; the model's slope is that "
-        "of the largest loop, and a small motion has less.",
+        "lower and higher, with which the loop keeps its margin, too. Dots are measured, with small motions, whose "
+        "slope is less than that of the largest loop, which the model shows; shaded: where both agree but for that.",
     )  # fmt: skip
     sensitivity = Chart([Panel(FREQUENCY, SENSITIVITY)], "column", 380)
     for each, label, colour, width in (
@@ -186,7 +192,8 @@ def _show(page: Page, name: str, axis: AxisModel, found: Design, measured: Frequ
         sensitivity.line(0, label, frequency, np.abs(1.0 / (1.0 + back)), colour, width=width)
     ends = frequency[[0, -1]]
     sensitivity.line(0, "-3 dB", ends, np.full(2, HALF), NOISE, width=1.2)
-    sensitivity.line(0, "no feedback", ends, np.ones(2), NOISE, width=1.2)
+    sensitivity.line(0, "no feedback", ends, np.ones(2), BEFORE, width=1.2)
+    sensitivity.line(0, "bandwidth", np.full(2, found.bandwidth), np.array([1e-2, 1.0]) * HALF, NOISE, width=1.2)
     page.section("What feedback does: errors by their frequency")
     page.chart(
         f"sensitivity-{name}", sensitivity,

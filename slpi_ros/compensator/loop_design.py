@@ -48,13 +48,17 @@ LIMITING = 1.15
 
 @dataclass(frozen=True)
 class Loop:
-    """A plant that is sampled once in each `period` (s), and those that it may be as well: the corners."""
+    """A plant that is sampled once in each `period` (s), and those that it may be as well: the corners.
+
+    The nominal plant has the slope of small motions, the corners that of the largest loop from end to end.
+    """
 
     nominal: Plant
     corners: tuple[Plant, ...]
     modes: tuple[Mode, ...]
     period: float
-    steep: float = 1.0  # steepest slope over that of the nominal plant
+    large: float = 1.0  # slope of the largest loop over that of the nominal plant
+    steep: float = 1.0  # steepest slope over that of the largest loop
     # What was measured over what the model says, at rising frequencies (rad/s), (M,) each, 1 at the lowest: one more
     # corner.
     measured: tuple[FloatArray, ComplexArray] | None = None
@@ -65,7 +69,8 @@ class Loop:
         if not model.causal:
             raise ModelError(f"kind {model.kind} needs the path in advance, feedback does not; identify another kind")
         steepest = Plant.of(model)
-        nominal = replace(steepest, slope=_mean_slope(model, steepest.slope))
+        largest = replace(steepest, slope=_mean_slope(model, steepest.slope))
+        nominal = replace(steepest, slope=min(_small_slope(model), largest.slope))
         if not (isfinite(nominal.slope) and nominal.slope > 0.0):
             raise ModelError(f"the model has a slope of {nominal.slope:g} m/V; identify it from a record that moves")
         modes = tuple(mode for effect in model.effects for mode in effect.ringing)
@@ -75,8 +80,8 @@ class Loop:
                     f"the mode at {mode.frequency:.4g} Hz is above half the loop's rate of {1.0 / period:.4g} Hz; give "
                     "a higher --rate, of sensor and output"
                 )
-        steep = steepest.slope / nominal.slope
-        return cls(nominal, tuple(_corners(model, nominal)), modes, period, steep, measured)
+        large, steep = largest.slope / nominal.slope, steepest.slope / largest.slope
+        return cls(nominal, tuple(_corners(model, largest)), modes, period, large, steep, measured)
 
     @cached_property
     def hardest(self) -> "Loop":
@@ -107,7 +112,7 @@ class Loop:
             # Modes that the model does not know are detuned, too.
             for scale in MEASURED_OFF:
                 size, angle = (np.interp(self.omega, scale * omega, of, left=0.0, right=0.0) for of in (sizes, angles))
-                rows.append(rows[0] * (1.0 + STEEPER) * np.exp(size + 1j * angle))
+                rows.append(rows[0] * self.large * (1.0 + STEEPER) * np.exp(size + 1j * angle))
         return np.array(rows)
 
     @cached_property
@@ -182,9 +187,9 @@ class Design:
 
     gains: PidGains
     period: float  # s
-    plant: Plant
+    plant: Plant  # with the slope of small motions
     margin: float  # least modulus margin of all corners
-    bandwidth: float  # Hz
+    bandwidth: float  # Hz, of small motions
     noise: float  # m, what the noise of the sensor moves the stage by
     limits: dict[str, float]  # bandwidth (Hz) without what limits it: "mode", "delay", "rate"; the largest first
 
@@ -280,9 +285,17 @@ def _mean_slope(model: AxisModel, steepest: float) -> float:
     return min((high - low) / (last - first), steepest) if last > first else steepest
 
 
-def _corners(model: AxisModel, nominal: Plant) -> Iterator[Plant]:
+def _small_slope(model: AxisModel) -> float:
+    """Return the slope (m/V) of a loop of `STEP` of the voltage range about its middle, after the largest one."""
+    low, high = model.hysteresis_range
+    middle, half = 0.5 * (low + high), 0.5 * STEP * (high - low)
+    y = model.memory("end").forward_array(np.array([low, high, low, middle + half, middle - half]))
+    return float(y[-2] - y[-1]) / (2.0 * half) if half > 0.0 else 0.0
+
+
+def _corners(model: AxisModel, largest: Plant) -> Iterator[Plant]:
     """Yield the plants that a model may mean as well."""
-    steep = nominal.slope * (1.0 + STEEPER)
+    steep = largest.slope * (1.0 + STEEPER)
     for scales in _detunings(sum(len(each.ringing) for each in model.effects)):
         for uncertain in (0.0, UNCERTAIN) if scales else (0.0,):
             changed, left = [], scales
@@ -290,9 +303,9 @@ def _corners(model: AxisModel, nominal: Plant) -> Iterator[Plant]:
                 count = len(effect.ringing)
                 changed.append(effect.detuned(left[:count], uncertain))
                 left = left[count:]
-            dynamics = nominal.dynamics if not scales else Plant.of(replace(model, effects=tuple(changed))).dynamics
+            dynamics = largest.dynamics if not scales else Plant.of(replace(model, effects=tuple(changed))).dynamics
             for later in (0.0, MESSAGES):
-                yield Plant(steep, nominal.delay + later, dynamics)
+                yield Plant(steep, largest.delay + later, dynamics)
 
 
 def _detunings(count: int) -> list[tuple[float, ...]]:

@@ -1,6 +1,7 @@
 """What ``slpi tune`` says of a loop: text, document and page."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from math import isfinite, pi
 from pathlib import Path
 from typing import Any
@@ -42,7 +43,8 @@ def describe(axis: AxisModel, found: Design) -> list[str]:
     if gains.measurement_filter:
         filters.append(f"measurement_filter {gains.measurement_filter * 1e3:.3g} ms")
     return [
-        f"bandwidth {found.bandwidth:.3g} Hz, modulus margin {found.margin:.2f} with each mode {DETUNING:.0%} off",
+        f"bandwidth {found.bandwidth:.3g} Hz of small motions, modulus margin {found.margin:.2f} with each mode "
+        f"{DETUNING:.0%} off and the slope of the largest loop",
         f"ki {gains.integral:.3g} V/(m s), kp {gains.proportional:.3g} V/m{''.join(f', {each}' for each in filters)}",
         f"a step of a tenth of the stroke, by feedback alone, is within 1 % after {_time(_settling(axis, found)[0])}, "
         f"within the noise after {_time(_settling(axis, found)[1])}",
@@ -59,8 +61,8 @@ def describe_measured(found: Design, measured: FrequencyResponse | None) -> list
     band = measured.agreement(model)
     where = f"agree from {band[0]:.3g} to {band[1]:.4g} Hz" if band else "agree nowhere"
     return [
-        f"measured and modelled response {where}, but for the slope: {measured.slope * 1e9:.3g} nm/V of small motions, "
-        f"{found.plant.slope * 1e9:.3g} nm/V of the largest loop; in the design both are used"
+        f"measured and modelled response {where}, but for the slope of small motions: {measured.slope * 1e9:.3g} and "
+        f"{found.plant.slope * 1e9:.3g} nm/V"
     ]
 
 
@@ -142,10 +144,8 @@ def write_files(
 
 
 def _show_measured(bode: Chart, found: Design, measured: FrequencyResponse) -> None:
-    """Add what was measured, with its interval of 95 %, and the model with its slope where both agree."""
+    """Add what was measured, with its interval of 95 %, and where the model agrees."""
     model = found.plant.response(2.0 * pi * measured.frequency)
-    shown = np.abs(model) * measured.slope / found.plant.slope
-    bode.line(0, "model, small motions", measured.frequency, shown, BEFORE, width=1.4)
     if band := measured.agreement(model):
         for panel in (0, 1):
             bode.span(panel, "agree", *band, AGREE)
@@ -166,7 +166,7 @@ def _show(page: Page, name: str, axis: AxisModel, found: Design, measured: Frequ
     bode = Chart([Panel(FREQUENCY, RESPONSE, 1.6), Panel(FREQUENCY, PHASE)], "column", 560)
     corners = (loop.corners[0], loop.corners[-1]) if loop.modes else ()
     for each, label, colour, width in (
-        *((corner, f"the mode {DETUNING:.0%} off", MEASURED, 1.0) for corner in corners),
+        *((replace(each, slope=loop.nominal.slope), f"the mode {DETUNING:.0%} off", MEASURED, 1.0) for each in corners),
         (loop.nominal, "model", DESIRED, 1.6),
     ):
         response = each.response(omega)
@@ -180,12 +180,13 @@ def _show(page: Page, name: str, axis: AxisModel, found: Design, measured: Frequ
         f"bode-{name}", bode,
         "How many nanometres the reading moves for each volt, and by how much it is late (360 degrees: a whole "
         "period). A peak is a mode: there the stage rings, and the notch takes the feedback out. Grey: that mode 10 % "
-        "lower and higher, with which the loop keeps its margin, too. Dots are measured, with small motions, whose "
-        "slope is less than that of the largest loop, which the model shows; shaded: where both agree but for that.",
+        "lower and higher, with which the loop keeps its margin, too. Dots are measured. "
+        f"Small motions have less slope than large ones, {loop.large:.2g} times as much in the largest loop, for which "
+        "the margin is kept. Shaded: where model and measurement agree but for a constant factor.",
     )  # fmt: skip
     sensitivity = Chart([Panel(FREQUENCY, SENSITIVITY)], "column", 380)
     for each, label, colour, width in (
-        *((corner, f"the mode {DETUNING:.0%} off", MEASURED, 1.0) for corner in corners),
+        *((corner, f"the mode {DETUNING:.0%} off, largest loop", MEASURED, 1.0) for corner in corners),
         (loop.nominal, "with these gains", AFTER, 1.8),
     ):
         back = DiscreteLoop(each, found.gains, found.period).response(omega)

@@ -240,7 +240,8 @@ def judged(seed: int) -> dict[str, float]:
     loop = Loop.of(replace(model, effects=effects), 1.0 / stage.rate)
     loop = replace(loop, nominal=replace(loop.nominal, slope=slope), corners=())
     g = stroke / (model.voltage_range[1] - model.voltage_range[0])
-    today = loop.bandwidth(Shape(0.0, 0.0, ()), rule / g)
+    # Far below mode and delay that of an integrator.
+    today = loop.bandwidth(Shape(0.0, 0.0, ()), rule / g) or rule / g * slope / (2.0 * pi)
     share, raster, seconds = RASTER
     none = np.empty(0)
 

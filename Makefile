@@ -42,7 +42,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test test-long test-jazzy test-newest test-kilted test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-recorder bench-oscillation bench-export bench-coverage bench-identification test-export-arm bench-company FORCE
+.PHONY: help build test test-long test-jazzy test-newest test-kilted test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-recorder bench-oscillation bench-tune bench-export bench-coverage bench-identification test-export-arm bench-company FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -81,6 +81,7 @@ help:
 	@echo 'make bench-learning  paths that repeat on stages of other physics, beside feedback and another learning; 20 minutes; LEARNING="--count 40 --all-paths"'
 	@echo 'make bench-loop-rate  crossover of the closed loop with 10, 100 and 1,000 commands a second, a minute'
 	@echo 'make bench-recorder  processor time of the recorder at 2 kHz, and what it loses when it is killed, 3 minutes; RECORDER="--beside PYTHON"'
+	@echo 'make bench-tune     30 stages identified and tuned without a hand: bandwidth, margin, detuned modes, a raster; half an hour'
 	@echo 'make bench-oscillation  feedback that oscillates and feedback that is well tuned: what is switched off, and when; six minutes'
 	@echo 'make bench-lies     eight kinds of sensors that lie, and honest ones: time driven, false alarms; ten minutes'
 	@echo 'make bench-rate-law  the rate law: round trips, cost, and what it predicts of measured records, 15 minutes'

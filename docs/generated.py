@@ -55,8 +55,8 @@ def _value(value):
 def _allowed(declaration):
     if declaration.choices:
         return ", ".join(map(code, declaration.choices))
-    if declaration.between:
-        low, high = (f"{bound:g}" for bound in declaration.between)
+    if bounds := declaration.between or declaration.lists:
+        low, high = (f"{bound:g}" for bound in bounds)
         return f"{low} to {high}"
     return ""
 

@@ -200,6 +200,8 @@ NAMED_ELSEWHERE = {
     "identification/record_quality.py": ({"creep", "delay", "lag"}, "what a drive lacks, in words"),
     "diagnosis/tracking.py": ({"delay"}, "a part of a tracking error"),
     "reports/verification.py": ({"delay"}, "the same, in words"),
+    "compensator/loop_design.py": ({"delay"}, "what limits the bandwidth of a loop, in words"),
+    "reports/tuning.py": ({"delay"}, "the same"),
     "model/uncertainty.py": ({"surroundings"}, "a component of the budget"),
     "reports/certificate.py": ({"surroundings"}, "the quantities of a record, in the document"),
     "nodes/compensator.py": ({"surroundings"}, "the same"),

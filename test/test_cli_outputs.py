@@ -62,6 +62,7 @@ def commands(inputs):
         "excite": (EXCITE, "t.csv"),
         "simulate": (("simulate", model, inputs / "voltage.csv"), "t.csv"),
         "compensate": (("compensate", model, inputs / "desired.csv"), "t.csv"),
+        "tune": (("tune", model), "m.yaml"),
     }
 
 
@@ -72,7 +73,7 @@ def refused(slpi, path, *arguments, code=2):
     return lines[0]
 
 
-@pytest.mark.parametrize("command", ["identify", "refit", "excite", "simulate", "compensate"])
+@pytest.mark.parametrize("command", ["identify", "refit", "excite", "simulate", "compensate", "tune"])
 def test_a_file_that_slpi_did_not_write_stays(slpi, inputs, tmp_path, command):
     arguments, name = commands(inputs)[command]
     for text in (FOREIGN, '{"schema": "slpi_ros/diagnosis/1"}', "time_s,x_V,y_V\n0,1,2\n", '{"mine": 1}'):
@@ -90,7 +91,7 @@ def test_a_file_that_slpi_did_not_write_stays(slpi, inputs, tmp_path, command):
     assert (tmp_path / "link").is_symlink() and sorted(os.listdir()) == ["link", name]
 
 
-@pytest.mark.parametrize("command", ["identify", "refit", "excite", "simulate", "compensate"])
+@pytest.mark.parametrize("command", ["identify", "refit", "excite", "simulate", "compensate", "tune"])
 def test_places_where_no_file_can_be(slpi, inputs, tmp_path, command):
     arguments, _ = commands(inputs)[command]
     (tmp_path / "folder").mkdir()

@@ -3,19 +3,23 @@
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.calibration.choice import next_drive
+from slpi_ros.calibration.closed_loop import LoopResult, gains_of, showing
 from slpi_ros.calibration.drives import SWEEP_SECONDS, checking, compensated, driven_so_far, exciting
 from slpi_ros.calibration.kept import FOLLOWS, naming, require_kept
 from slpi_ros.calibration.settings import CALIBRATION, CalibrationSettings
+from slpi_ros.compensator.feedback import PidGains
+from slpi_ros.compensator.loop_design import design
 from slpi_ros.compensator.plausible import implausible_noise, implausible_stroke
 from slpi_ros.diagnosis.result import Diagnosis
+from slpi_ros.diagnosis.step_answers import step_answers
 from slpi_ros.effects.base import Effect, EffectContext
-from slpi_ros.errors import RecordError, length
+from slpi_ros.errors import RecordError, SlpiError, length
 from slpi_ros.excitation.drives import CALIBRATION as CALIBRATION_DRIVE
 from slpi_ros.excitation.drives import SWEEP, Drive
 from slpi_ros.identification.held_readings import without_held
@@ -28,7 +32,7 @@ from slpi_ros.workflows.diagnose import DiagnoseRequest, diagnose
 from slpi_ros.workflows.identify import IdentifyRequest, identify
 from slpi_ros.workflows.records import Source
 
-CHECK_DRIVE, VERIFICATION_DRIVE = "check", "verification"
+CHECK_DRIVE, VERIFICATION_DRIVE, LOOP_DRIVE = "check", "verification", "closed_loop"
 # A displacement follows if it moves by this multiple of its noise.
 MOVES = 10.0
 # Rest before the first move of an axis that is diagnosed with it, seconds.
@@ -57,6 +61,7 @@ class Request:
     name: str
     drive: Drive
     desired: Mapping[str, FloatArray]  # m, (N,), at the samples of the drive; empty without compensator
+    gains: Mapping[str, PidGains] = field(default_factory=dict)  # of the feedback along the path; empty: none
 
 
 @dataclass(frozen=True)
@@ -108,6 +113,7 @@ class Outcome:
     diagnosis: Diagnosis  # the last one, of all records before the last verification
     steps: tuple[Step, ...]
     why: str  # the target is met or not, and why the calibration ended
+    loops: Mapping[str, LoopResult] = field(default_factory=dict)  # of tuned feedback, if it was asked for
 
     @property
     def met(self) -> bool:
@@ -191,14 +197,15 @@ class _Calibration:
         judged = [
             {axis: replace(error, goal=goals[axis]) for axis, error in errors.items()} for _, errors in self._verified
         ]
+        loops = self._tune(self._verified[-1][0]) if settings.tune else {}
         model = _left_at(self._verified[-1][0], self._records[-1])
-        return Outcome(settings, model, judged[-1], diagnosis, tuple(self._steps), why(judged, diagnosis, ended))
+        return Outcome(settings, model, judged[-1], diagnosis, tuple(self._steps), why(judged, diagnosis, ended), loops)
 
     @property
     def _left(self) -> float:
         """Time (s) left for drives before the last verification."""
         verification = max((step.seconds for step in self._steps if step.errors), default=self._settings.verification)
-        return self._settings.budget - self._used - verification
+        return self._settings.budget - self._settings.loops - self._used - verification
 
     @property
     def _used(self) -> float:
@@ -211,12 +218,18 @@ class _Calibration:
         left = max(self._settings.budget - self._used, 0.0)
         self._report(Progress(doing, len(self._steps) + 1, left, worst))
 
-    def _recorded(self, kind: str, drive: Drive, desired: Mapping[str, FloatArray]) -> Recording:
+    def _recorded(
+        self,
+        kind: str,
+        drive: Drive,
+        desired: Mapping[str, FloatArray],
+        gains: Mapping[str, PidGains] | None = None,
+    ) -> Recording:
         name = f"{len(self._steps) + 1:02d}_{kind}"
         self._begin(f"recording {name}")
-        recording = self._record(Request(name, drive, desired))
+        recording = self._record(Request(name, drive, desired, gains or {}))
         if recording.kept:
-            fitted = kind not in (CHECK_DRIVE, SWEEP)
+            fitted = kind not in (CHECK_DRIVE, SWEEP, LOOP_DRIVE)
             require_kept(recording.record, drive, self._settings, self._first, fitted=fitted)
         if self._settings.accept_stage and same_stage(recording.record.hardware_id, self._settings.accept_stage):
             recording = replace(recording, record=replace(recording.record, hardware_id=""))
@@ -300,6 +313,34 @@ class _Calibration:
         self._steps.append(Step(recording.record.source, float(drive.t[-1]), drive.why, finding, errors))
         self._verified.append((model, errors))
         return errors
+
+    def _tune(self, model: StageModel) -> dict[str, LoopResult]:
+        """Design the feedback of each axis, and follow steps and a raster with it."""
+        settings, found = self._settings, dict[str, LoopResult]()
+        self._begin("tuning the feedback")
+        for name in settings.axes:
+            try:
+                made = design(model.axis(name), settings.rate)
+                told = f"bandwidth {made.bandwidth:.3g} Hz, modulus margin {made.margin:.2f} predicted"
+                found[name] = LoopResult(made, told)
+            except SlpiError as none:
+                found[name] = LoopResult(None, f"no feedback: {none}")
+        shown = {name: one for name, one in found.items() if one.design}
+        if shown:
+            model = with_present_zero(model, self._records)
+            path = replace(settings, path=showing(settings, model))
+            drive, desired = compensated(path, model, len(self._steps), self._records)
+            recording = self._recorded(LOOP_DRIVE, drive, desired, gains_of(found))
+            for name, one in shown.items():
+                error = tracking_error(recording, name, model, settings.goal(self._repeatability[name]))
+                steps = step_answers(error.t, error.desired, error.error, model.axis(name).quality.floor_rms)
+                told = f"{one.told}; on the stage {error.told()}"
+                found[name] = replace(one, told=told, steps=steps)
+            self._records.append(recording.record)
+        finding = "; ".join(f"axis {name}: {one.told}" for name, one in found.items())
+        name, seconds = (self._records[-1].source, float(drive.t[-1])) if shown else ("tune", 0.0)
+        self._steps.append(Step(name, seconds, "feedback of the largest bandwidth: steps and a raster", finding))
+        return found
 
 
 def _diagnosed(records: Sequence[Record], model: StageModel) -> Diagnosis:

@@ -9,7 +9,7 @@ from slpi_ros.errors import UsageError
 from slpi_ros.model.limits import Limits
 
 # Durations of the drives, seconds for each axis that moves; those of separate effects take EFFECT.
-CALIBRATION, EFFECT, CHECK, VERIFICATION = 40.0, 25.0, 1.5, 20.0
+CALIBRATION, EFFECT, CHECK, VERIFICATION, LOOP = 40.0, 25.0, 1.5, 20.0, 15.0
 
 
 @dataclass(frozen=True)
@@ -25,6 +25,7 @@ class CalibrationSettings:
     times_repeatability: float = 3.0
     accept_units: bool = False  # whether a stroke or a noise that no stage has is taken for one
     seed: int = 0  # of the random parts of the drives
+    tune: bool = False  # whether feedback at `rate` is tuned, and shown on the stage
     accept_stage: str = ""  # name of a stage whose kept bags are taken for those of this one
     # m, (N,), by axis at `rate`: the path that is to be covered, and on which models are verified; none: random ones
     path: Mapping[str, FloatArray] = field(default_factory=dict, compare=False)
@@ -55,7 +56,12 @@ class CalibrationSettings:
     @property
     def least(self) -> float:
         """Shortest time (s) in which a model can be identified and verified."""
-        return len(self.axes) * (CALIBRATION + CHECK) + 2 * self.verification
+        return len(self.axes) * (CALIBRATION + CHECK) + 2 * self.verification + self.loops
+
+    @property
+    def loops(self) -> float:
+        """Time (s) in which tuned feedback is shown."""
+        return LOOP * len(self.axes) if self.tune else 0.0
 
     @property
     def verification(self) -> float:

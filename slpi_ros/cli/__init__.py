@@ -31,6 +31,7 @@ from slpi_ros.cli import (
     refit,
     show,
     simulate,
+    tune,
     verify,
 )
 from slpi_ros.cli.command import MOST_LINES, Command, say
@@ -52,6 +53,7 @@ COMMANDS: Mapping[str, Command] = {
     "compensate": compensate.COMMAND,
     "learn": learn.COMMAND,
     "export": export.COMMAND,
+    "tune": tune.COMMAND,
     "doctor": doctor.COMMAND,
     "call": call.COMMAND,
     "param": param.COMMAND,

@@ -31,6 +31,11 @@ def _add_options(command: ArgumentParser) -> None:
         help=f"effect that the record must distinguish from others: {', '.join(DRIVES[1:])}; default: {DRIVES[0]}",
     )  # fmt: skip
     command.add_argument(
+        "--for-response",
+        action="store_true",
+        help="small multisines about three biases, for the frequency response (slpi tune); default: no",
+    )
+    command.add_argument(
         "--for-path", metavar="PATH",
         help="desired path whose range, rates and turns the record must cover: a table, as for slpi compensate, or a "
         "bag with desired_trajectory or desired_displacement; default: none",
@@ -45,28 +50,35 @@ def _run(options: Namespace) -> Result:
     import numpy as np
 
     from slpi_ros.arrays.rates import fastest
-    from slpi_ros.excitation.drives import SLEW_USED, excite
+    from slpi_ros.excitation.drives import DRIVES, SLEW_USED, excite
     from slpi_ros.excitation.path import with_path
+    from slpi_ros.excitation.response import response_drive
     from slpi_ros.io.outputs import allow_table
     from slpi_ros.io.tables import table_header, write_table
     from slpi_ros.model.coverage import FASTER
 
     if options.model and not options.for_path:
         raise UsageError("--model is of use with --for-path only; give the path, or leave it out")
+    if options.for_response and (options.for_path or options.drive != DRIVES[0]):
+        raise UsageError("--for-response is a drive of its own; leave --for and --for-path out")
     path, rate = _path_of(options) if options.for_path else ({}, options.rate or RATE)
     axes = options.axis or list(path) or ["x"]
     common.require_axis_names(axes)
     options.remarks += allow_table(options.output, table_header(axes, "V"), overwrite=options.overwrite)
     slew = SLEW_USED * common.slew_of(options)
-    drive = excite(
-        axes,
-        voltage_min=options.voltage_min,
-        voltage_max=options.voltage_max,
-        slew_limit=slew,
-        duration=options.duration,
-        rate=rate,
-        seed=options.seed,
-        drive=options.drive,
+    drive = (
+        response_drive(axes, options.voltage_min, options.voltage_max, slew, options.duration, rate, options.seed)
+        if options.for_response
+        else excite(
+            axes,
+            voltage_min=options.voltage_min,
+            voltage_max=options.voltage_max,
+            slew_limit=slew,
+            duration=options.duration,
+            rate=rate,
+            seed=options.seed,
+            drive=options.drive,
+        )
     )
     if path:
         drive = with_path(drive, path)

@@ -17,6 +17,9 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument(
         "--target", choices=tuple(TARGETS), default="c", help="C11 source (default), or units for simulators (FMI)"
     )
+    command.add_argument(
+        "--gains", metavar="GAINS.yaml", help="also export the feedback with the gains of slpi tune; default: none"
+    )
     command.add_argument("--voltage-min", metavar="V", type=float, default=-math.inf, help="default: identified range")
     command.add_argument("--voltage-max", metavar="V", type=float, default=math.inf, help="default: identified range")
     command.add_argument(
@@ -35,6 +38,10 @@ def _run(options: Namespace) -> Result:
     model = load_model(options.model)
     limits = Limits(options.voltage_min, options.voltage_max, options.slew_limit or math.inf)
     stage, target = ExportedStage.of(model, limits, options.axis), TARGETS[options.target]
+    if options.gains is not None:
+        from slpi_ros.compensator.gains_file import TunedGains
+
+        stage = stage.with_feedback(TunedGains.read(options.gains))
     options.remarks += target.allow(options.output, overwrite=options.overwrite)
     names = target.write(options.output, stage)
     options.remarks += target.remarks(stage)

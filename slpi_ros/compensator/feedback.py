@@ -4,6 +4,7 @@ from collections import deque
 from dataclasses import dataclass, fields
 from math import exp, expm1, inf, isfinite, sqrt
 
+from slpi_ros.compensator.loop_filter import Filtered, LoopFilter, Notch
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.model.limits import MAX_DT, RateLimiter
 
@@ -21,12 +22,21 @@ class PidGains:
     integral: float = 0.0  # V/(m s)
     derivative: float = 0.0  # V s/m; on the measured displacement only, not on the setpoint
     derivative_filter: float = 0.0  # s, time constant of its low-pass filter; 0: none
+    measurement_filter: float = 0.0  # s, time constant of the low-pass filter of the readings; 0: none
+    notches: tuple[Notch, ...] = ()  # of the readings
 
     def __post_init__(self) -> None:
         for field in fields(self):
+            if field.name == "notches":
+                continue
             value = getattr(self, field.name)
             if not (isfinite(value) and value >= 0.0):
                 raise UsageError(f"PID gain {field.name} is {value}; give a finite value that is not negative")
+
+    @property
+    def filters(self) -> bool:
+        """Whether readings are filtered."""
+        return bool(self.notches or self.measurement_filter)
 
     def direct(self, error: float, rate: float) -> float:
         """Return the part of the correction (V) that an error (m) and a measured rate (m/s) make at once."""
@@ -44,6 +54,9 @@ class Feedback:
     #
     # Windup is avoided by conditional integration: the integral grows only as far as the voltage can follow. Unlike
     # back-calculation, this keeps the integral while the voltage is slew limited on the way to a distant feedforward.
+    #
+    # Notches and low pass take the error, reading and setpoint alike, so that their lag is no error while the stage
+    # moves. They step once in each period of `pace`, whose filters they are, also over periods without a measurement.
     #
     # The error refers to the setpoint at the time of the measurement, not to the present one, and for a sensor with a
     # known delay or lag to the setpoint as that sensor would tell it, see `slpi_ros.model.sensor.Sensed`.
@@ -66,6 +79,9 @@ class Feedback:
         self._last_ns = self._measured_ns = self._latest_ns = -inf
         self._latest: tuple[float, float | None] | None = None  # that one (m), and the setpoint (m) at that time
         self._desired: float | None = None
+        # Filter of the gains at the period of `pace`, and what it has come to.
+        self._filter: LoopFilter | None = None
+        self._filtered: Filtered
 
     def switch(self, on: bool) -> None:
         """Enable the PID without a voltage step at the next measurement; once it is off, the correction decays."""
@@ -82,6 +98,8 @@ class Feedback:
     def retune(self, gains: PidGains) -> None:
         """Replace the gains without a voltage step, or raise and keep them if they give no finite voltage."""
         error, rate = self._error, self._rate
+        if (gains.notches, gains.measurement_filter) != (self.gains.notches, self.gains.measurement_filter):
+            self._filter = None
         offset = self._offset + (self.gains.direct(error, rate) - gains.direct(error, rate))
         if not isfinite(offset):
             raise UsageError(f"{gains} give no finite voltage; check their units")
@@ -91,7 +109,10 @@ class Feedback:
         """Return the voltage (V) for desired and measured displacement (m), within all limits, or raise unchanged."""
         self._require_order(now_ns)
         elapsed = (now_ns - self._measured_ns) * 1e-9
-        error, rate = desired - measured, self._next_rate(elapsed, measured)
+        error = desired - measured
+        if filtered := self._filter_next(now_ns, elapsed, error, measured):
+            error, measured = filtered.error, filtered.reading
+        rate = self._next_rate(elapsed, measured)
         direct = self.gains.direct(error, rate)
         if not isfinite(direct):
             raise UsageError(f"desired {desired} m, measured {measured} m gives no finite voltage; hold the sample")
@@ -107,7 +128,34 @@ class Feedback:
         self._error, self._rate = error, rate
         if elapsed > 0.0:
             self._measured_ns, self._measured = now_ns, measured
+        if filtered:
+            self._filtered = filtered
         return v
+
+    def _filter_next(self, now_ns: int, elapsed: float, error: float, measured: float) -> Filtered | None:
+        """Return error and reading (m) after the filter; None if there is none."""
+        gains, pace = self.gains, self.pace
+        if not (gains.filters and self.enabled) or not isfinite(error):
+            self._filter = None
+            return None
+        found = self._filter
+        if found is None or found.period != pace.period:
+            found = self._filter = LoopFilter(gains.notches, gains.measurement_filter, pace.period)
+            # Without a step: as if the last filtered error had always been there.
+            self._filtered = found.resting(self._error, self._measured, max(now_ns - pace.period_ns, 0))
+        before = self._filtered
+        if elapsed > self.longest_gap:
+            return found.resting(error, measured, now_ns)
+        if elapsed == 0.0:
+            return before
+        steps = max(round((now_ns - before.now_ns) / pace.period_ns), 1)
+        end_ns = min(before.now_ns + steps * pace.period_ns, now_ns + pace.period_ns)
+        error, errors = found.after(before.errors, error, steps)
+        # Only the derivative takes the reading itself.
+        readings = before.readings
+        if gains.derivative:
+            measured, readings = found.after(readings, measured, steps)
+        return Filtered(error, measured, errors, readings, end_ns)
 
     def hold(self, now_ns: int, feedforward: float) -> float:
         """Return the voltage (V) without measurement, or raise unchanged: the correction is kept, or decays."""

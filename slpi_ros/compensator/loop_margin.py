@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.compensator.feedback import PidGains
+from slpi_ros.compensator.loop_filter import Section, response, sections
 from slpi_ros.effects.filters import AT_ONCE, Dynamics, first_order
 from slpi_ros.model.axis_model import AxisModel
 
@@ -48,6 +49,13 @@ class Plant:
         slope = _steepest(model) * float(np.prod([effect.steepest for effect in chain.own]))
         return cls(slope, max(chain.delay, 0.0) + sensor.delay, dynamics)
 
+    def response(self, omega: FloatArray) -> ComplexArray:
+        """Return the frequency response, m/V, shape (N,), at `omega` (rad/s) of the plant itself, without a hold."""
+        a, b, c, d = self.dynamics
+        states = 1j * omega[:, None, None] * np.eye(len(b)) - a
+        driven = np.linalg.solve(states, np.broadcast_to(b[:, None], (omega.size, len(b), 1)))[..., 0]
+        return np.asarray(self.slope * (driven @ c + d) * np.exp(-1j * omega * self.delay))
+
 
 @dataclass(frozen=True)
 class Margins:
@@ -67,13 +75,15 @@ class Margins:
 class DiscreteLoop:
     """PID feedback of a plant once in each `period` (s), as `Feedback` computes it, without the feedforward.
 
+    UsageError for a notch that is not below half the rate.
+
     The correction from a reading is output one period after it, and held over the next one. With the sampled signals
     and ``z = exp(i w period)``, ``L(z) = C(z) P(z) / z``::
 
-        C = kp + ki T z / (z - 1) + kd / T (1 - a) (z - 1) / (z - a),   a = exp(-T / derivative_filter)
+        C = F (kp + ki T z / (z - 1) + kd / T (1 - a) (z - 1) / (z - a)),   a = exp(-T / derivative_filter)
 
-    and P the plant with a zero-order hold, exact for any delay (Åström and Wittenmark, Computer-Controlled Systems,
-    3rd ed., 2.3).
+    F the notches and the low pass of the readings, and P the plant with a zero-order hold, exact for any delay (Åström
+    and Wittenmark, Computer-Controlled Systems, 3rd ed., 2.3).
     """
 
     plant: Plant
@@ -85,12 +95,17 @@ class DiscreteLoop:
         gains, z = self.gains, np.exp(1j * omega * self.period)
         kept = np.exp(-self.period / gains.derivative_filter) if gains.derivative_filter else 0.0
         slope = gains.derivative / self.period * (1.0 - kept) * (z - 1.0) / (z - kept)
-        return np.asarray(gains.proportional + gains.integral * self.period * z / (z - 1.0) + slope)
+        pid = np.asarray(gains.proportional + gains.integral * self.period * z / (z - 1.0) + slope)
+        return pid * response(self._filter, z) if self._filter else pid
+
+    @cached_property
+    def _filter(self) -> tuple[Section, ...]:
+        return sections(self.gains.notches, self.gains.measurement_filter, self.period)
 
     @np.errstate(over="ignore", invalid="ignore")
     def response(self, omega: FloatArray) -> ComplexArray:
         """Return the return ratio L, shape (N,), at `omega` (rad/s, 0 to pi / period)."""
-        kept, early, late = self._held
+        kept, early, late = self.held
         z, whole = np.exp(1j * omega * self.period), ceil(self.plant.delay / self.period)
         direct = self.plant.dynamics.d
         reading = np.full(omega.shape, direct, dtype=complex)
@@ -101,7 +116,7 @@ class DiscreteLoop:
         return np.asarray(self.controller(omega) * self.plant.slope * reading * z ** -(whole + 1.0))
 
     @cached_property
-    def _held(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+    def held(self) -> tuple[FloatArray, FloatArray, FloatArray]:
         """States after a period, and what comes in of the newer and of the older voltage, as the delay is."""
         (a, b, _, _), period = self.plant.dynamics, self.period
         older = self.plant.delay - (ceil(self.plant.delay / period) - 1) * period
@@ -130,6 +145,10 @@ class DiscreteLoop:
         # A mode above the highest frequency is seen below it.
         folded = np.abs((poles.imag + highest) % (2.0 * highest) - highest)
         near = (folded[:, None] - poles.real[:, None] * BESIDE).ravel()
+        # Beside the zeros of each notch, too, where 1 + L may turn.
+        for notch in self.gains.notches:
+            w = 2.0 * pi * notch.frequency
+            near = np.append(near, w + BESIDE * max(notch.damping, 1e-3) * w)
         lowest = LOWEST * slowest
         omega = np.concatenate([np.geomspace(lowest, highest, FREQUENCIES), near, [highest]])
         omega = np.unique(omega[(omega >= lowest) & (omega <= highest)])

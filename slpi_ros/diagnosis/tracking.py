@@ -8,6 +8,7 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.arrays.rates import rates
+from slpi_ros.diagnosis.step_answers import StepAnswer, followed_up_to, step_answers
 from slpi_ros.errors import RecordError
 
 # A delay is accepted if it reduces the difference between model and desired displacement by this factor.
@@ -116,6 +117,22 @@ class Tracking:
     parts: Mapping[str, FloatArray]  # m, (N,), of each cause, with noise in "model"
     behind: float = 0.0  # s, of `delay`, by which the stage is later than its model
     delays: tuple[float, ...] | None = None  # s, range of a delay that varies: 5th and 95th percentile
+    noise_rms: float = 0.0  # m, of what does not repeat
+
+    @property
+    def whole(self) -> FloatArray:
+        """Measured - desired, m, (N,)."""
+        return np.asarray(np.sum(list(self.parts.values()), axis=0))
+
+    @property
+    def bandwidth(self) -> float | None:
+        """Lowest frequency (Hz) at which the error reaches -3 dB of the path; None: the path does not show it."""
+        return followed_up_to(self.t, self.desired, self.whole)
+
+    @property
+    def steps(self) -> tuple[StepAnswer, ...]:
+        """Answers to the steps of the path, by rising size."""
+        return step_answers(self.t, self.desired, self.whole, self.noise_rms)
 
     @property
     def rms(self) -> dict[str, float]:
@@ -154,6 +171,8 @@ class Tracking:
             "blame": self.blame,
             "delay_s": self.delay,
             "delay_range_s": list(self.delays) if self.delays else None,
+            "bandwidth_Hz": self.bandwidth,
+            "step_answers": [each.to_document() for each in self.steps],
         }
 
 
@@ -223,6 +242,7 @@ def track(
         desired=d,
         parts=parts,
         delays=None if delays is None else tuple(np.quantile(delays, (0.05, 0.95)).tolist()),
+        noise_rms=noise_rms,
     )
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.arrays.rates import fastest
 from slpi_ros.effects.excitation import Excitation
-from slpi_ros.effects.filters import AT_ONCE, Dynamics, Uniform
+from slpi_ros.effects.filters import AT_ONCE, Dynamics, Mode, Uniform
 from slpi_ros.effects.parameters import Leaf, facts_of, leaves, require_facts, with_leaves
 from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.io.record import Course
@@ -409,6 +409,15 @@ class EffectBase(Protocol):
     def dynamics(self) -> Dynamics:
         """Its linear dynamics, without a transport delay, as a fast closed loop sees them; of most effects none."""
         return AT_ONCE
+
+    @property
+    def ringing(self) -> Sequence[Mode]:
+        """Its modes, as a fast closed loop excites them; of most effects none."""
+        return ()
+
+    def detuned(self, scales: Sequence[float], uncertain: float) -> "Effect":
+        """Return it with the frequencies of `ringing` scaled, and dampings less by so many standard uncertainties."""
+        return self  # type: ignore[return-value]
 
     @property
     def steepest(self) -> float:

@@ -40,6 +40,8 @@ from slpi_ros.effects.parameters import as_list, parameter, require
 
 # A zero is near a mode up to this ratio of the squared frequencies, which is the largest gain of `Exact`.
 NEAR = 10.0
+# Of a damping that is uncertain at least this share is assumed.
+LEAST_DAMPING = 0.5
 # Largest number of modes, and the smallest share of the motion beside the modes that is none by rounding.
 MOST_MODES, LEAST_REST = 10, 1e-9
 
@@ -350,6 +352,20 @@ class Resonance(EffectBase):
             a[2 * k : 2 * k + 2, 2 * k : 2 * k + 2] = mode.a
         gains = np.repeat([mode.gain for mode in self.modes], 2)
         return Dynamics(a, np.concatenate([m.b for m in each]), gains * np.concatenate([m.c for m in each]), self.rest)
+
+    @property
+    def ringing(self) -> tuple[Mode, ...]:
+        """Its modes."""
+        return self.modes
+
+    def detuned(self, scales: Sequence[float], uncertain: float) -> "Resonance":
+        """Return the modes with scaled frequencies, and dampings less by so many standard uncertainties."""
+        modes = []
+        for k, (mode, scale) in enumerate(zip(self.modes, scales, strict=True)):
+            unsure = uncertain * self.uncertainty.get(f"modes.{k}.damping", 0.0)
+            damping = max(mode.damping - unsure, LEAST_DAMPING * mode.damping)
+            modes.append(replace(mode, frequency=mode.frequency * scale, damping=damping))
+        return replace(self, modes=tuple(modes))
 
     def describe(self) -> str:
         """Describe frequency, damping and share of each mode."""

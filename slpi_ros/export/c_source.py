@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.filters import DAMPING, WIDEST
+from slpi_ros.export.feedback import ExportedLoop
 from slpi_ros.export.stage import HISTORY, ExportedAxis, ExportedStage
 from slpi_ros.hysteresis.shapes import END, FAR
 from slpi_ros.model.limits import MAX_DT
@@ -299,11 +300,32 @@ def context_of(stage: ExportedStage) -> Mapping[str, Any]:
             {"key": comment(one.key), "lowest": f"{one.lowest:.6g}", "highest": f"{one.highest:.6g}"}
             for one in stage.quantities
         ],
+        "feedback": _feedback(stage.loops),
         "coupling": {
             "gains": _matrix(stage.gains),
             "inverse": _matrix(np.linalg.inv(np.eye(len(axes)) + stage.gains)),
             "origins": "{" + ", ".join(number(origin) for origin in stage.model.origins.values()) + "}",
         },
+    }
+
+
+def _feedback(loops: Sequence[ExportedLoop]) -> dict[str, Any] | None:
+    """Return what the templates say of the feedback; None without one."""
+    if not loops:
+        return None
+    rows, laws = list[FloatArray](), []
+    for loop in loops:
+        own, gains = loop.sections, loop.gains
+        values = (gains.proportional, gains.integral, gains.derivative, loop.moved, loop.most)
+        laws.append(f"{{{len(rows)}, {len(own)}, {', '.join(map(number, values))}}}")
+        rows += [np.array([one.b0, one.b1, one.b2, one.a1, one.a2]) for one in own]
+    return {
+        "rows": ["{" + ", ".join(map(number, row)) + "}" for row in rows or [np.zeros(5)]],
+        "laws": laws,
+        "period": repr(loops[0].period),
+        "released": repr(loops[0].released),
+        "most": max(1, *(len(loop.sections) for loop in loops)),
+        "range": " and ".join(f"{loop.most:.4g}" for loop in loops),
     }
 
 

@@ -92,11 +92,22 @@ def fmu(stage: ExportedStage, unit: Unit, version: str) -> bytes:
         }
         for k, one in enumerate(stage.quantities, 1)
     ]
+    # Only the inverse has feedback.
+    loops = stage.loops if unit.given[0] == "desired" else ()
+    measured = [
+        {"name": f"measured_{name}", "reference": 0, "causality": "input", "unit": "m", "start": start}
+        for name, start in zip(names, starts, strict=True)
+        if loops
+    ]
+    for k, each in enumerate(measured, 1 + 2 * len(names) + len(quantities)):
+        each["reference"] = k
     context: dict[str, Any] = {
+        "limits": [(repr(axis.allowed.lower), repr(axis.allowed.upper)) for axis in stage.axes] if loops else [],
         "quantities": quantities, "limited": unit.limited(stage), "longest": repr(MAX_DT), "most": repr(LONGEST_STEP),
         "version": version, "what": unit.what, "file": file, "token": f"{{{token}}}", "starts": starts,
-        "function": unit.function, "identifier": unit.identifier, "step": repr(STEP),
-        "variables": [*inputs, *outputs, *quantities],
+        "function": unit.function, "identifier": unit.identifier,
+        "step": repr(loops[0].period if loops else STEP),
+        "variables": [*inputs, *outputs, *quantities, *measured],
         "description": f"{unit.what} of a piezo stage: {told}",
     }  # fmt: skip
     sources[file] = _filled("slpi_fmu.c", context)

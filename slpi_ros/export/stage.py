@@ -1,7 +1,7 @@
 """What is exported: the axes of a model with their limits, the numbers of their inverse, and what is left out."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from math import inf, isfinite, isinf, pi
 from typing import Any, NamedTuple
@@ -9,11 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
+from slpi_ros.compensator.gains_file import TunedGains
 from slpi_ros.effects.base import Followed
 from slpi_ros.effects.filters import SPACING
 from slpi_ros.effects.paths import Laws
 from slpi_ros.effects.surroundings import Surroundings
 from slpi_ros.errors import UsageError
+from slpi_ros.export.feedback import ExportedLoop, exported_loops
 from slpi_ros.hysteresis.kinds import DESCRIPTIONS, PathModel
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.multi_slope import STEEP, MultiSlope
@@ -211,6 +213,11 @@ class ExportedStage:
 
     axes: tuple[ExportedAxis, ...]
     model: StageModel
+    loops: tuple[ExportedLoop, ...] = ()  # feedback of each axis; (): none
+
+    def with_feedback(self, tuned: TunedGains) -> "ExportedStage":
+        """Return the export with the feedback of tuned gains; UsageError if they lack an axis."""
+        return replace(self, loops=exported_loops(tuned, [(axis.name, axis.allowed) for axis in self.axes]))
 
     @classmethod
     def of(cls, model: StageModel, limits: Limits, names: Sequence[str] | None = None) -> "ExportedStage":

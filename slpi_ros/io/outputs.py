@@ -15,6 +15,8 @@ _Path = str | os.PathLike[str]
 
 # First element of every page, by which it is known as one of slpi's.
 PAGE_MARK = '<meta name="generator" content="slpi_ros">'
+# First words of every file of gains.
+GAINS_MARK = "# Gains of a compensator, by slpi tune"
 # Bytes at both ends of a file that tell what it is: a document and a page at its beginning, a table of results at its
 # end; the longest header of a table is shorter, too.
 _ENDS = 64 * 1024
@@ -38,6 +40,12 @@ def allow_table(path: _Path, header: str, *, overwrite: bool = False) -> list[st
     """Check that a table may be written: like `allow_document`, for a CSV file with the first line `header`."""
     first = _ends(path)[0].split(b"\n", 1)[0]
     return _allow_file(Path(path), f"no table with the columns {header}", overwrite, is_own=first == header.encode())
+
+
+def allow_gains(path: _Path, *, overwrite: bool = False) -> list[str]:
+    """Check that gains may be written: like `allow_document`, for a parameter file that ``slpi tune`` wrote."""
+    own = _ends(path)[0].startswith(GAINS_MARK.encode())
+    return _allow_file(Path(path), "no gains that slpi tune wrote", overwrite, is_own=own)
 
 
 def allow_folder(

@@ -12,6 +12,7 @@ from rclpy.node import Node
 from std_msgs.msg import String
 
 from slpi_ros.arrays import FloatArray
+from slpi_ros.calibration.closed_loop import ClosedLoop
 from slpi_ros.calibration.drive_monitor import FARTHEST
 from slpi_ros.calibration.run import Progress
 from slpi_ros.calibration.settings import CalibrationSettings
@@ -59,6 +60,10 @@ DECLARATIONS = declare.read_only(
         "accept_units", False,
         "Whether to go on where the stroke or the noise is none of a piezo stage, as of displacements in a wrong unit.",
     ),
+    Declaration(
+        "tune", False,
+        "Whether to tune feedback at rate too, and show it on the stage by steps and a raster: gains.yaml in output.",
+    ),
     Declaration("seed", 0, "Seed of the random parts of the drives.", between=(0, 2**31 - 1)),
     declare.STATE_TIMEOUT,
     declare.ACCEPT_STAGE,
@@ -90,16 +95,27 @@ class _Job:
     `fail` is called with the reason if the bag cannot be written.
     """
 
-    def __init__(self, wanted: Wanted, output: Path, axes: Sequence[str], fail: Callable[[SlpiError], None]) -> None:
+    def __init__(
+        self, wanted: Wanted, output: Path, axes: Sequence[str], fail: Callable[[SlpiError], None],
+        loop: ClosedLoop | None,
+    ) -> None:  # fmt: skip
         self.wanted, self._bag, self._fail = wanted, BagWriter(output / wanted.name, topic=f"/{STATE}"), fail
-        self._encoder = JointStateEncoder(axes, "")
+        self._encoder, self.loop = JointStateEncoder(axes, ""), loop
         if wanted.desired.size:
             self._bag.add_topic(PATH)
         self._at, self._tail = 0.0, TAIL  # time in the drive, and for the last readings to arrive; seconds
 
     def goals(self) -> list[float]:
         """Return the voltages (V) of the drive at its present time."""
-        return [float(np.interp(self._at, self.wanted.t, v)) for v in self.wanted.voltage.T]
+        voltages = self._present(self.wanted.voltage)
+        return (
+            self.loop.goals(voltages, self._present(self.wanted.desired), time.monotonic_ns())
+            if self.loop
+            else voltages
+        )
+
+    def _present(self, columns: FloatArray) -> list[float]:
+        return [float(np.interp(self._at, self.wanted.t, column)) for column in columns.T]
 
     def advance(self, dt: float) -> None:
         """Go on by a time (s)."""
@@ -115,8 +131,7 @@ class _Job:
     def keep_desired(self, stamp: int, voltages: Sequence[float]) -> None:
         """Record the desired displacements at the present time, if there are any, with the voltages (V) sent then."""
         if self.wanted.desired.size:
-            desired = [float(np.interp(self._at, self.wanted.t, y)) for y in self.wanted.desired.T]
-            self.write(stamp, self._encoder.encode(stamp, desired, voltages), PATH)
+            self.write(stamp, self._encoder.encode(stamp, self._present(self.wanted.desired), voltages), PATH)
 
     def write(self, stamp: int, message: bytes, topic: str) -> None:
         """Record a message."""
@@ -151,7 +166,10 @@ def settings_of(values: Values) -> CalibrationSettings:
         budget=values["budget"] * len(axes),
         target=values["target"] * 1e-6,
         path=_path_of(values["desired_path"], axes, values["rate"]) if values["desired_path"] else {},
-        **{name: values[name] for name in ("rate", "times_repeatability", "accept_stage", "accept_units", "seed")},
+        **{
+            name: values[name]
+            for name in ("rate", "times_repeatability", "accept_stage", "accept_units", "seed", "tune")
+        },
     )
 
 
@@ -248,7 +266,10 @@ class Calibrator(Node):
             error = "" if said.error is None else f", mean error {said.error * 1e6:.4f} µm"
             self.get_logger().info(f"step {said.step}: {said.doing}; {said.seconds_left:.0f} s of drives left{error}")
         elif isinstance(said, Wanted):
-            self._job, self._stepped = _Job(said, self._output, self._settings.axes, self._fail), time.monotonic()
+            settings, voltages = self._settings, self._guard.voltages
+            loop = ClosedLoop(said.gains, settings.limits, settings.rate, voltages) if said.gains else None
+            self._job = _Job(said, self._output, settings.axes, self._fail, loop)
+            self._stepped = time.monotonic()
             self._guard.begin()
         else:
             self._outcome = said
@@ -344,10 +365,12 @@ class Calibrator(Node):
                 "another output, or set accept_stage"
             )
 
-    def _on_state(self, data: bytes, clock_ns: int) -> None:
+    def _on_state(self, data: bytes, clock_ns: int, displacements: Sequence[float]) -> None:
         """Record a state if a drive is on its way."""
         if self._job is not None and not self._returning:
             self._job.write(clock_ns, data, f"/{STATE}")
+            if self._job.loop and displacements:
+                self._job.loop.measure(displacements, time.monotonic_ns())
 
     # Ends
 

@@ -7,6 +7,7 @@ from math import nan
 from typing import Any
 
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
+from slpi_ros.compensator.loop_filter import Notch
 from slpi_ros.compensator.motion import Safety
 from slpi_ros.compensator.ownership import STARTS
 from slpi_ros.compensator.validation import TimestampRules
@@ -141,6 +142,26 @@ DECLARATIONS = (
     declare.each_axis(
         "derivative_filter", 0.0, "Time constant of the derivative low-pass, seconds; 0: none.", (0.0, 1e3)
     ),
+    declare.each_axis(
+        "measurement_filter", 0.0,
+        "Time constant of a first-order low-pass of what the feedback takes of the readings, seconds; 0: none.",
+        (0.0, 1e3),
+    ),
+    declare.list_of_each_axis(
+        "notch_frequency", 0.0,
+        "Frequencies of the notches of the feedback of an axis, one for each mode, hertz, below half of output_rate; "
+        "[0.0]: none.",
+        (0.0, 1e4),
+    ),
+    declare.list_of_each_axis(
+        "notch_damping", 0.0,
+        "Damping of the numerator of these notches, that of the mode or more. One value, or one for each notch.",
+        (0.0, 10.0),
+    ),
+    declare.list_of_each_axis(
+        "notch_width", 1.0, "Damping of the denominator of these notches: the width. One value, or one for each notch.",
+        (1e-3, 10.0),
+    ),
     Declaration(
         "force_gains", False,
         "Whether gains are taken with which the loop of the model is unstable or hardly stable (modulus margin below "
@@ -219,7 +240,8 @@ class CompensatorSettings:
                 f"model_sha256 {values['model_sha256']!r} is not 64 hexadecimal digits in lower case; give the output "
                 "of sha256sum, or nothing"
             )
-        gains = zip(values["kp"], values["ki"], values["kd"], values["derivative_filter"], strict=True)
+        numbers = (values[name] for name in ("kp", "ki", "kd", "derivative_filter", "measurement_filter"))
+        gains = zip(*numbers, _notches(values), strict=True)
         timeout = values["measurement_timeout"]
         limits = limits_of(values)
         ranges = [each.upper - each.lower for each in limits]
@@ -256,6 +278,28 @@ class CompensatorSettings:
                     f"axis '{name}': safe_voltage {voltage:g} V is outside voltage_min..voltage_max, "
                     f"{limits.lower:g}..{limits.upper:g} V; choose one inside"
                 )
+
+
+def _notches(values: Mapping[str, Any]) -> list[tuple[Notch, ...]]:
+    """Return the notches of each axis; UsageError for numbers of another count, or above half of output_rate."""
+    lists = (values[f"notch_{name}.AXIS"] for name in ("frequency", "damping", "width"))
+    found = []
+    for axis, frequencies, *others in zip(values["axes"], *lists, strict=True):
+        for name, several in zip(("damping", "width"), others, strict=True):
+            if len(several) not in (1, len(frequencies)):
+                raise UsageError(
+                    f"parameter notch_{name}.{axis} has {len(several)} values, notch_frequency.{axis} has "
+                    f"{len(frequencies)}; give one value, or one for each notch"
+                )
+        dampings, widths = (each * len(frequencies) if len(each) == 1 else each for each in others)
+        own = tuple(Notch(*each) for each in zip(frequencies, dampings, widths, strict=True) if each[0])
+        try:
+            for notch in own:
+                notch.require_below(values["output_rate"])
+        except UsageError as error:
+            raise UsageError(f"axis '{axis}': {error}") from None
+        found.append(own)
+    return found
 
 
 def _starts(values: Mapping[str, Any]) -> tuple[str | float, ...]:

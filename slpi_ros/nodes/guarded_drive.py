@@ -27,7 +27,7 @@ from slpi_ros.nodes.parameters import Values, limits_of
 # A voltage is at its goal within this share of the range. Time for the delivery of the last voltage.
 ARRIVED, DELIVERY = 1e-6, Duration(seconds=1.0)
 
-OnState = Callable[[bytes, int], None]
+OnState = Callable[[bytes, int, Sequence[float]], None]
 
 
 class GuardedDrive:
@@ -35,8 +35,9 @@ class GuardedDrive:
 
     Every voltage passes `move`, the last place before it is published, which keeps the limits by the steady clock; it
     is called at the rate of the validated parameters `values`, which hold axes and limits as well; `state_timeout` is
-    the longest time without a valid state during a drive. `on_state` is called with each serialized state and its time
-    on the clock of the node. The name of the node begins messages of errors.
+    the longest time without a valid state during a drive. `on_state` is called with each serialized state, its time
+    on the clock of the node, and its displacements (m), none if it is not valid. The name of the node begins messages
+    of errors.
     """
 
     def __init__(self, node: Node, values: Values, on_state: OnState | None = None, publisher: Any = None) -> None:
@@ -233,9 +234,10 @@ class GuardedDrive:
         v, y = ([float(values.get(axis, math.nan)) for axis in self._axes] for values in (volts, metres))
         clock_ns = self._node.get_clock().now().nanoseconds
         self._state_ns = self._state_ns or time.monotonic_ns()
-        if self.monitor.state(nanoseconds(state.header.stamp), clock_ns, v, y, time.monotonic_ns()):
+        valid = self.monitor.state(nanoseconds(state.header.stamp), clock_ns, v, y, time.monotonic_ns())
+        if valid:
             self.reported, self.hardware_id = v, state.header.frame_id
             if not self.reports(self.voltages):
                 self._away = time.monotonic()
         if self._on_valid is not None:
-            self._on_valid(data, clock_ns)
+            self._on_valid(data, clock_ns, y if valid else ())

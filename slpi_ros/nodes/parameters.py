@@ -37,6 +37,7 @@ class Declaration:
     each_axis: bool = False  # each axis may have its own value
     choices: tuple[str, ...] = ()  # of a string; (): any
     required: bool = False  # NaN is refused; else it stands for None, if it is the default
+    lists: Range | None = None  # of the numbers of a list, of which each axis has one; the name ends with ".AXIS"
     path: bool = False  # of a file or folder, or several; ~ is the home folder, which no shell puts in after ":="
 
     def expanded(self, given: Any) -> Any:
@@ -47,6 +48,8 @@ class Declaration:
 
     def read(self, values: Values, axes: Sequence[str]) -> Any:
         """Return the validated value from `values`: a tuple with one value per axis if `each_axis`."""
+        if self.lists:
+            return tuple(_listed(values, named, self.default, *self.lists) for named in self.names(axes))
         given = values[self.name]
         if _is_nan(given) and _is_nan(self.default) and not self.required:
             # It depends on other parameters.
@@ -64,6 +67,10 @@ class Declaration:
             raise UsageError(f"parameter {self.name} is {given!r}; choose one of {', '.join(self.choices)}")
         return given
 
+    def names(self, axes: Sequence[str]) -> list[str]:
+        """Return the names that the node declares: for lists one for each axis."""
+        return [self.name.removesuffix("AXIS") + axis for axis in axes] if self.lists else [self.name]
+
     @property
     def _is_switch(self) -> bool:
         """Whether it is on or off, which YAML takes for true and false."""
@@ -74,7 +81,7 @@ class Declaration:
         described = ParameterDescriptor(
             description=self.description,
             read_only=self.read_only,
-            dynamic_typing=self.number or self._is_switch,
+            dynamic_typing=self.number or self._is_switch or self.lists is not None,
         )
         if self.between and not _is_nan(self.default):
             low, high = self.between
@@ -98,6 +105,11 @@ def each_axis(name: str, default: float, description: str, between: Range, *, re
     """Declare a numeric parameter that may have one value for each axis."""
     description += " One value, or one for each axis."
     return Declaration(name, default, description, between=between, number=True, each_axis=True, required=required)
+
+
+def list_of_each_axis(name: str, default: float, description: str, between: Range) -> Declaration:
+    """Declare a list of numbers of each axis."""
+    return Declaration(f"{name}.AXIS", [default], description, lists=between)
 
 
 def text(name: str, default: str, description: str, *choices: str, read_only: bool = False) -> Declaration:
@@ -189,11 +201,14 @@ class Parameters(Generic[Settings]):
 
     def __init__(self, node: Node, declarations: Sequence[Declaration], make: Callable[[Values], Settings]) -> None:
         self._node, self._make = node, make
-        self._entries = {entry.name: entry for entry in declarations}
-        self._values: dict[str, Any] = {
-            entry.name: entry.expanded(node.declare_parameter(entry.name, entry.default, entry.descriptor()).value)
-            for entry in declarations
-        }
+        self._entries: dict[str, Declaration] = {}
+        self._values: dict[str, Any] = {}
+        for entry in declarations:
+            # The names of the axes are declared first.
+            for name in entry.names(self._values.get("axes") or ()):
+                self._entries[name] = entry
+                given = node.declare_parameter(name, entry.default, entry.descriptor())
+                self._values[name] = entry.expanded(given.value)
         self.settings = make(self._values)
         self._tell_unknown(node)
         for remark in (*leading_zeros(sys.argv), *overridden(sys.argv, node)):
@@ -237,6 +252,15 @@ class Parameters(Generic[Settings]):
             for change in changes
             if change.name in self._entries
         }
+
+
+def _listed(values: Values, name: str, default: Sequence[float], low: float, high: float) -> tuple[float, ...]:
+    """Return the numbers, from `low` to `high`, of a parameter that is a list, or one number."""
+    given = values.get(name, default)
+    several = list(given) if isinstance(given, Sequence) and not isinstance(given, str) else [given]
+    # An empty list is given as None.
+    several = list(default) if several in ([], [None]) else several
+    return tuple(numbers({name: several}, name, several, low, high))
 
 
 def numbers(values: Values, name: str, axes: Sequence[str], low: float, high: float) -> list[float]:

@@ -2,7 +2,9 @@
 
 from pathlib import Path
 
+from slpi_ros.calibration.closed_loop import gains_of
 from slpi_ros.calibration.run import Outcome
+from slpi_ros.compensator.gains_file import TunedGains
 from slpi_ros.errors import length
 from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.model.document import save_model
@@ -10,9 +12,11 @@ from slpi_ros.reports import diagnosis as diagnosis_files
 from slpi_ros.reports.chart import AFTER, BEFORE, DESIRED, DISPLACEMENT, TIME, Chart, Panel, Quantity, thin_line
 from slpi_ros.reports.page import Page
 from slpi_ros.reports.text import describe_model
+from slpi_ros.reports.tuning import describe
+from slpi_ros.reports.verification import show_steps
 
-# The model, the page, and the folder with the files of the last diagnosis.
-MODEL, PAGE, DIAGNOSIS = "model.json", "report.html", "diagnosis"
+# The model, the page, the folder with the files of the last diagnosis, and the gains of a tuned loop.
+MODEL, PAGE, DIAGNOSIS, GAINS = "model.json", "report.html", "diagnosis", "gains.yaml"
 TRACKING_ERROR = Quantity("measured - desired", "nm", 1e9, ".1f")
 
 
@@ -21,6 +25,9 @@ def write_files(folder: Path, outcome: Outcome) -> None:
     make_folder(folder)
     save_model(outcome.model, str(folder / MODEL))
     diagnosis_files.write_files(folder / DIAGNOSIS, outcome.diagnosis)
+    if any(one.design for one in outcome.loops.values()):
+        stage = f" for stage {outcome.model.hardware_id}" if outcome.model.hardware_id else ""
+        TunedGains(outcome.settings.rate, gains_of(outcome.loops)).write(str(folder / GAINS), stage)
     page_of(outcome).write(folder / PAGE)
 
 
@@ -59,6 +66,12 @@ def page_of(outcome: Outcome) -> Page:
         page.chart(
             f"{axis}-tracking", _chart(outcome, axis), "The last path, and the errors of the first and the last."
         )
+    for axis, loop in outcome.loops.items():
+        page.heading(f"Feedback of axis {axis}", f"{axis}-loop")
+        page.text(f"At {outcome.settings.rate:g} Hz, in {GAINS}: {loop.told}.")
+        if loop.design:
+            page.lines(describe(outcome.model.axis(axis), loop.design))
+        show_steps(page, axis, loop.steps)
     page.heading("What was recorded, why, and what it showed")
     rows = [
         (step.name, f"{step.seconds:.0f} s" if step.seconds else "", step.why, step.finding) for step in outcome.steps

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from slpi_ros.diagnosis.step_answers import StepAnswer
 from slpi_ros.diagnosis.tracking import CAUSES, Burst, ErrorPart, Tracking
 from slpi_ros.diagnosis.verify import (
     FAILED,
@@ -41,6 +42,7 @@ from slpi_ros.reports.page import Page, Severity
 
 FILES = "verification.json", "report.html"
 TRACKING_ERROR = Quantity("measured - desired", "nm", 1e9, ".1f")
+STEP_SIZE, SETTLING = Quantity("step", "µm", 1e6, ".4g"), Quantity("settling time", "ms", 1e3, ".4g")
 COLOUR = {**dict(zip(CAUSES, (*COLOURS, AFTER), strict=False)), "model": BEFORE, "noise": NOISE}
 SEVERITY: dict[str, Severity] = {PASSED: "good", UNPROVED: "warn", FAILED: "bad"}
 # Names of the parts of a tracking error; smaller ones than this share of the rms without the zero are
@@ -265,9 +267,26 @@ def _tracking_notes(tracking: Tracking) -> list[str]:
     return [
         f"path: measured - desired is {length(error.rms)} rms, {length(error.maximum)} at most, without the zero "
         f"{length(tracking.rest_rms)} rms; of it {', '.join(told)}",
+        *_loop_notes(tracking),
         *([_when(burst)] if burst else []),
         f"path, largest part: {tracking.advice(tracking.blame)}",
     ]
+
+
+def _loop_notes(tracking: Tracking) -> list[str]:
+    """Return what a path shows of the loop: bandwidth, and answers to steps."""
+    followed = tracking.bandwidth
+    told = [f"path: bandwidth {followed:.3g} Hz, where the error reaches -3 dB of the path"] if followed else []
+    return told + [
+        f"path: {each.count} step{'s' if each.count > 1 else ''} of {length(each.size)}: overshoot "
+        f"{each.overshoot:.1%}, within 1 % after {_settled(each.settled)}, within the noise after "
+        f"{_settled(each.quiet)}"
+        for each in tracking.steps[:MOST_TIMES]
+    ]
+
+
+def _settled(seconds: float | None) -> str:
+    return "more than the set point lasts" if seconds is None else f"{seconds * 1e3:.3g} ms"
 
 
 def _when(burst: Burst) -> str:
@@ -365,7 +384,7 @@ def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
         caption="Rms by which each part enters the whole; of parts that cancel, the smaller one is left out.",
     )
     chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, TRACKING_ERROR, 1.2)], "column", 540)
-    error = np.sum(list(tracking.parts.values()), axis=0)
+    error = tracking.whole
     t, desired = tracking.t, tracking.desired
     kept = thin_line(desired, error)
     chart.line(0, "measured", t[kept], (desired + error)[kept], MEASURED, width=2.6)
@@ -376,7 +395,30 @@ def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
             some = thin_line(part)
             chart.line(1, cause, t[some], part[some], COLOUR[cause], width=1.0)
     said = views.focus(chart, (1,), [error])
+    show_steps(page, name, tracking.steps)
     page.chart(f"{name}-tracking", chart, f"Desired and measured displacement, and the parts of the error. {said}")
+
+
+def show_steps(page: Page, name: str, steps: Sequence[StepAnswer]) -> None:
+    """Add how steps of the path settle, by their size."""
+    if not steps:
+        return
+    page.table(
+        ("step", "number", "overshoot", "within 1 % after", "within the noise after"),
+        [
+            (length(each.size), str(each.count), f"{each.overshoot:.1%}", _settled(each.settled), _settled(each.quiet))
+            for each in steps
+        ],
+        caption="Steps of the set point by their size; of each size the worst.",
+    )
+    chart = Chart([Panel(STEP_SIZE, SETTLING)], "column", 300)
+    sizes = np.array([each.size for each in steps])
+    for label, times, colour in (
+        ("to 1 %", [each.settled for each in steps], AFTER),
+        ("to the noise", [each.quiet for each in steps], BEFORE),
+    ):
+        chart.dots(0, label, sizes, np.array(times, dtype=float), colour)
+    page.chart(f"{name}-steps", chart, "Settling time by the size of the step, where it settles before the next one.")
 
 
 def _um(metres: float) -> str:

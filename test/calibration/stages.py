@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from slpi_ros.calibration.closed_loop import ClosedLoop
 from slpi_ros.calibration.run import Recording, Request
 from slpi_ros.calibration.settings import CalibrationSettings
 from slpi_ros.io.record import Record
@@ -42,9 +43,26 @@ class SimulatedRecorder:
         drive = request.drive
         rows = np.column_stack(list(drive.voltage.values())).tolist()
         t = (self.now + drive.t).tolist()
-        y = np.array([self.stage.measure(self.stage.step(at, row)) for at, row in zip(t, rows, strict=True)])
+        if request.gains:
+            rows, y = self._followed(request, t, rows)
+        else:
+            y = np.array([self.stage.measure(self.stage.step(at, row)) for at, row in zip(t, rows, strict=True)])
         time_ns = np.round((self.now + drive.t) * 1e9).astype(np.int64)
         self.now = t[-1] + PAUSE
-        record = Record(time_ns, drive.voltage, dict(zip(drive.axes, y.T, strict=True)), request.name, "simulated")
+        voltage = dict(zip(drive.axes, np.array(rows).T, strict=True))
+        record = Record(time_ns, voltage, dict(zip(drive.axes, y.T, strict=True)), request.name, "simulated")
         self.recordings.append(Recording(record, request.desired))
         return self.recordings[-1]
+
+    def _followed(self, request, t, rows):
+        """Return voltages and readings with feedback, each from the reading before."""
+        count = len(rows[0])
+        loop = ClosedLoop(list(request.gains.values()), settings("xyz"[:count]).limits, RATE, rows[0])
+        desired = np.column_stack(list(request.desired.values())).tolist()
+        sent, readings = [], []
+        for at, row, wanted in zip(t, rows, desired, strict=True):
+            now_ns = round(at * 1e9)
+            sent.append(loop.goals(row, wanted, now_ns))
+            readings.append(self.stage.measure(self.stage.step(at, sent[-1])))
+            loop.measure(readings[-1], now_ns + 1)
+        return sent, np.array(readings)

@@ -521,7 +521,7 @@ def test_the_same_samples_give_the_same_voltages(script):
 # What makes no controller.
 
 
-@pytest.mark.parametrize("name", asdict(PID))
+@pytest.mark.parametrize("name", [name for name in asdict(PID) if name != "notches"])
 @pytest.mark.parametrize("value", [-1e-9, NAN, INF])
 def test_gains_that_make_no_sense(name, value):
     with pytest.raises(UsageError, match=f"^PID gain {name} is [^\n]+$"):

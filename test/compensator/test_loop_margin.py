@@ -8,6 +8,7 @@ import pytest
 from strategies import PI_CASE, axis_model
 
 from slpi_ros.compensator.feedback import Feedback, PidGains
+from slpi_ros.compensator.loop_filter import Notch
 from slpi_ros.compensator.loop_margin import LEAST_MARGIN, DiscreteLoop, Plant, refusal
 from slpi_ros.effects.contact import Contact
 from slpi_ros.effects.delay import Delay
@@ -71,6 +72,10 @@ KINDS = {
     "integral": PidGains(0.0, 30.0 / SLOPE),
     "proportional": PidGains(0.1 / SLOPE),
     "both": PidGains(0.05 / SLOPE, 20.0 / SLOPE),
+    "a notch and a low pass": PidGains(0.05 / SLOPE, 20.0 / SLOPE, 0.0, 0.0, 1e-3, (Notch(60.0, 0.05, 0.8),)),
+    "filters, and all three": PidGains(
+        0.05 / SLOPE, 20.0 / SLOPE, 0.02 * T / SLOPE, 3e-3, 5e-4, (Notch(60.0, 0.02), Notch(80.0, 0.1, 0.6))
+    ),
     "all three": PidGains(0.05 / SLOPE, 20.0 / SLOPE, 0.02 * T / SLOPE, 3e-3),
 }
 

@@ -11,10 +11,13 @@ rclpy = pytest.importorskip("rclpy")
 
 from nodes.compensator_client import PERIOD_NS, START_NS, Client, compensator  # noqa: E402
 from nodes.ros_helpers import stage_model  # noqa: E402
+from rcl_interfaces.srv import GetParameters  # noqa: E402
 from rclpy.qos import qos_profile_sensor_data  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
-from slpi_ros.compensator.feedback import Drift  # noqa: E402
+from slpi_ros.compensator.feedback import Drift, PidGains  # noqa: E402
+from slpi_ros.compensator.gains_file import TunedGains  # noqa: E402
+from slpi_ros.compensator.loop_filter import Notch  # noqa: E402
 from slpi_ros.model.document import save_model  # noqa: E402
 from slpi_ros.nodes.compensator_diagnostics import remedy  # noqa: E402
 
@@ -167,3 +170,21 @@ def test_what_oscillates_is_not_only_blamed_on_the_memory(state, mean, advised):
     told = [remedy(axis, Drift(mean=mean, rms=5.1e-8, samples=500), since) for since in (499, 500)]
     assert "busy" in told[0] and "changed" not in told[0] and told[1] == said
     assert ("interference" in said) == advised and ("~/reset_memory" in said) == (state == "assumed")
+
+
+def test_gains_and_notches_of_a_file_are_taken_and_a_notch_above_half_the_rate_is_refused(tmp_path, x_file):
+    """The file of ``slpi tune``, on a running node: one call, and one line where the rate does not suffice."""
+    path = tmp_path / "gains.yaml"
+    TunedGains(1000.0, {"x": PidGains(1e5, 1e8, measurement_filter=1e-3, notches=(Notch(120.0, 0.05),))}).write(
+        str(path)
+    )
+    with compensator("--ros-args", "--params-file", str(path), model_file=x_file, feedback=True) as client:
+        client.connect()
+        asked = GetParameters.Request(names=["notch_frequency.x", "ki"])
+        first, second = client.graph.call(GetParameters, f"{client.name}/get_parameters", asked).values
+        assert list(first.double_array_value) == [120.0] and second.double_value == 1e8
+        assert client.graph.set_parameters(client.name, **{"notch_frequency.x": [90.0, 210.0], "ki": 5e7}) == ""
+        for wrong in ({"output_rate": 300.0}, {"notch_frequency.x": [600.0]}, {"notch_damping.x": [0.1] * 3}):
+            said = client.graph.set_parameters(client.name, **wrong)
+            assert "notch_" in said and "\n" not in said
+        assert client.graph.set_parameters(client.name, output_rate=500.0) == ""

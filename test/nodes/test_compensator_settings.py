@@ -11,6 +11,7 @@ import yaml
 
 rclpy = pytest.importorskip("rclpy")
 
+from slpi_ros.compensator.loop_filter import Notch  # noqa: E402
 from slpi_ros.errors import UsageError  # noqa: E402
 from slpi_ros.model.limits import Limits  # noqa: E402
 from slpi_ros.nodes.compensator_parameters import DECLARATIONS, CompensatorSettings  # noqa: E402
@@ -65,6 +66,34 @@ def test_a_value_that_makes_no_sense_is_named(values):
     assert name in str(caught.value) and "\n" not in str(caught.value)
 
 
+def test_each_axis_has_its_notches():
+    told = settings(
+        axes=["x", "y"], measurement_filter=[0, 1e-3],
+        **{"notch_frequency.x": [120, 310.0], "notch_damping.x": [0.02], "notch_width.x": array("d", [0.7, 1.5])},
+    ).loops  # fmt: skip
+    assert told[0].gains.notches == (Notch(120.0, 0.02, 0.7), Notch(310.0, 0.02, 1.5)) and told[1].gains.notches == ()
+    assert [loop.gains.measurement_filter for loop in told] == [0.0, 1e-3]
+    # A number is a list of one, and [0.0] none.
+    assert settings(**{"notch_frequency.x": 120.0}).loops[0].gains.notches == (Notch(120.0),)
+    assert settings(**{"notch_frequency.x": [0.0, 90.0]}).loops[0].gains.notches == (Notch(90.0),)
+    assert settings(**{"notch_frequency.x": None}).loops[0].gains.notches == ()
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"notch_frequency.x": [500.0]}, {"notch_frequency.x": [-1.0]}, {"notch_frequency.x": "all"},
+        {"notch_frequency.x": [math.inf]}, {"notch_frequency.x": [90.0], "output_rate": 100.0},
+        {"notch_damping.x": [0.1, 0.2]}, {"notch_width.x": [0.0]}, {"measurement_filter": -1.0},
+        {"notch_frequency.x": [90.0, 80.0, 70.0], "notch_width.x": [1.0, 1.0]},
+    ], ids=str,
+)  # fmt: skip
+def test_a_notch_that_makes_no_sense_is_named_in_one_line(values):
+    with pytest.raises(UsageError) as caught:
+        settings(**values)
+    assert next(iter(values)).split(".")[0].split("_")[0] in str(caught.value) and "\n" not in str(caught.value)
+
+
 def test_learning_is_off_and_takes_what_yaml_makes_of_on_and_off():
     told = settings().values
     assert (told["learn"], told["learn_period"], told["learn_limit"]) == ("off", 0.0, None)
@@ -90,7 +119,7 @@ def test_an_array_is_shown_as_it_was_given():
 
 def parameters(path: Path, commented: bool = False) -> dict[str, Any]:
     """Return what a file sets, and what it would set without the # before parameters."""
-    text = re.sub(r"^    #(\w+:)", r"    \1", path.read_text(), flags=re.M) if commented else path.read_text()
+    text = re.sub(r"^    #([\w.]+:)", r"    \1", path.read_text(), flags=re.M) if commented else path.read_text()
     return yaml.safe_load(text)["/**"]["ros__parameters"]
 
 
@@ -103,7 +132,8 @@ def test_config_files_hold_known_parameters(path):
 
 def test_one_file_shows_every_parameter_and_its_default():
     path = CONFIG / "one_axis.yaml"
-    shown = {name: str(value) for name, value in parameters(path, commented=True).items()}
+    told = parameters(path, commented=True).items()
+    shown = {re.sub(r"\.x$", ".AXIS", name): str(value) for name, value in told}
     assert shown == {name: str(value) for name, value in (DEFAULTS | {"slew_limit": 1000.0}).items()}
     assert parameters(path).keys() == {"axes", "model_file", "voltage_min", "voltage_max", "slew_limit"}
 

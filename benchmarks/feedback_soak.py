@@ -9,7 +9,7 @@ import random
 import struct
 import tempfile
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Sequence
 from math import pi, sin
 from pathlib import Path
@@ -30,8 +30,9 @@ from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.model.document import format_model, save_model
 from slpi_ros.nodes.common import make_executor
 
-# Messages on their way: fewer than the queues of the node hold, so that a busy machine loses none.
-AHEAD = 60
+# Messages on their way: fewer than the queues of the node hold, so that a busy machine loses none. How many have come
+# the node reports every 50 ms: feedback publishes voltages between the answers, too.
+AHEAD, REPORT_S = 80, 0.05
 # Samples from one trajectory and from one model to the next, points of a trajectory, and samples at one displacement
 # before it, so that both axes are at rest; 1 ms each.
 TRAJECTORY_EVERY, MODEL_EVERY, POINTS, REST = 20_000, 7_000, 1_000, 300
@@ -47,8 +48,6 @@ class Soak:
         self.pid, self.rng = pid, random.Random(seed)
         self.counts: Counter[str] = Counter()
         self.top = 0.9 * stage().axes["x"].displacement_range[1]
-        # Stamps of the samples and points that are still to be answered.
-        self.pending: deque[int] = deque()
         self.now = START_NS
         # Voltages during a trajectory; None while there is none.
         self._points: list[Sequence[float]] | None = None
@@ -88,7 +87,6 @@ class Soak:
         while not done():  # type: ignore[operator]
             if time.monotonic() > deadline:
                 self.wrong(f"waited in vain for {what}; the last report: {self.report}")
-                self.pending.clear()
                 return
             self._executor.spin_once(timeout_sec=0.02)
 
@@ -125,13 +123,16 @@ class Soak:
                 self._executor.spin_once(timeout_sec=0.0)
             # After a time without the processor, samples follow as fast as they are answered.
             due = max(due, time.monotonic() - 1.0)
-        self.until(lambda: not self.pending, "the last answers")
+        self.until(lambda: not self._pending(), "the last answers")
+
+    def _pending(self) -> int:
+        """Return how many samples have not come yet."""
+        return self.counts["samples"] - int(self.report.get("received", 0))
 
     def _send(self, y: float) -> None:
-        if len(self.pending) >= AHEAD:
-            self.until(lambda: len(self.pending) < AHEAD, "answers")
+        if self._pending() >= AHEAD:
+            self.until(lambda: self._pending() < AHEAD, "answers")
         self.now += MS
-        self.pending.append(self.now)
         self._desired.publish(self._filled(self.now, y, 0.8 * y))
         self.counts["samples"] += 1
 
@@ -144,7 +145,7 @@ class Soak:
         """Come to rest at a displacement (m), and follow a trajectory of a second from there and back."""
         for _ in range(REST):
             self._send(y)
-        self.until(lambda: not self.pending, "answers before a trajectory")
+        self.until(lambda: not self._pending(), "answers before a trajectory")
         message = JointTrajectory(joint_names=AXES)
         for k in range(POINTS):
             part = y + 0.05 * self.top * (1.0 - np.cos(2 * pi * k / POINTS)) * (1.0 if y < 0.5 * self.top else -1.0)
@@ -176,13 +177,8 @@ class Soak:
         voltages = struct.unpack("=2d", data[-16:])
         if self._points is not None:
             self._points.append(voltages)
-        elif self.pending:
-            self.counts["answers"] += 1
-            self.pending.popleft()
-            self._judge(voltages)
         else:
-            # The displacement is held while nothing is sent.
-            self.counts["held"] += 1
+            self.counts["voltages"] += 1
             self._judge(voltages)
         drift = 20e-9 * sin(self.now * 1e-9 / 60.0)
         position = [
@@ -211,7 +207,7 @@ def soak(minutes: float, seed: int) -> list[tuple[str, Counter[str]]]:
         save_model(stage(), path)
         given = {
             "axes": AXES, "model_file": str(path), "memory_file": str(memory), "voltage_min": LOW, "voltage_max": HIGH,
-            "slew_limit": 0.0, "feedback": True, "ki": 2e8, "kp": 1e6,
+            "slew_limit": 0.0, "feedback": True, "ki": 2e8, "kp": 1e6, "diagnostic_period": REPORT_S,
         }  # fmt: skip
         with started("compensator", given, "-r", "__ns:=/soak") as node:
             one = Soak(node.process.pid, seed)
@@ -235,7 +231,8 @@ def soak(minutes: float, seed: int) -> list[tuple[str, Counter[str]]]:
             one.close()
     rclpy.try_shutdown()
     print(
-        f"soak: {one.counts['answers'] / took:.0f} answers/s for {took / 60:.1f} min, memory {grown:+d} KiB", flush=True
+        f"soak: {one.counts['voltages'] / took:.0f} voltages/s for {took / 60:.1f} min, memory {grown:+d} KiB",
+        flush=True,
     )
     rows = [("soak at 1 kHz, samples", Counter(tried=one.counts["samples"], wrong=one.counts["wrong"]))]
     rows += [

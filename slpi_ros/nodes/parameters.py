@@ -69,7 +69,7 @@ class Declaration:
 
     def names(self, axes: Sequence[str]) -> list[str]:
         """Return the names that the node declares: for lists one for each axis."""
-        return [self.name.removesuffix("AXIS") + axis for axis in axes] if self.lists else [self.name]
+        return [self.name.removesuffix("AXIS") + axis for axis in dict.fromkeys(axes)] if self.lists else [self.name]
 
     @property
     def _is_switch(self) -> bool:

@@ -19,6 +19,7 @@ sys.path.append(str(Path(__file__).resolve().parents[1] / "test"))
 import numpy as np
 from nodes.ros_helpers import RELIABLE, on_graph, stage_model, started
 from sensor_msgs.msg import JointState
+from std_msgs.msg import Float64MultiArray
 
 from slpi_ros.model.document import save_model
 
@@ -35,7 +36,7 @@ def crossover(rate: float, model_file: str) -> tuple[float, float]:
     stage = {"rate": 1000.0, "answer_commands": False, "noise_rms": 1e-9, "seed": 7}
     loop = {
         "model_file": model_file, "ki": INTEGRAL, "correction_limit": 100.0, "feedback_fault_time": 0.0,
-        "slew_limit": 0.0, "start_voltage": "saved", "drift_alarm": 0.0,
+        "slew_limit": 0.0, "start_voltage": "saved", "drift_alarm": 0.0, "accept_stage": "simulated-7",
     }  # fmt: skip
     remapped = ("--ros-args", "-r", "measured_displacement:=stage_state")
     with (
@@ -49,6 +50,8 @@ def crossover(rate: float, model_file: str) -> tuple[float, float]:
         graph.node.create_subscription(
             JointState, "/stage_state", lambda state: states.append((time.monotonic(), state.position[0])), 1000
         )
+        voltages: list[Float64MultiArray] = []
+        graph.node.create_subscription(Float64MultiArray, "/voltage_command", voltages.append, 1000)
         ends = threading.Event()
 
         def send() -> None:
@@ -62,6 +65,9 @@ def crossover(rate: float, model_file: str) -> tuple[float, float]:
         sender = threading.Thread(target=send)
         sender.start()
         try:
+            # The compensator looks first who else is there.
+            while not voltages:
+                graph.spin_for(0.1)
             graph.spin_for(SETTLING)
             assert simulator.process.poll() is None
             before = len(states)

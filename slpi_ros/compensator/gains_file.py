@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from slpi_ros.compensator.feedback import PidGains
-from slpi_ros.compensator.loop_filter import Notch
+from slpi_ros.compensator.loop_filter import notches_of
 from slpi_ros.errors import UsageError, dependencies_needed
 from slpi_ros.io.atomic_file import all_or_nothing
 from slpi_ros.io.input_limits import METADATA_BYTES, open_input
@@ -17,7 +17,8 @@ NUMBERS = {
     "kp": "proportional", "ki": "integral", "kd": "derivative", "derivative_filter": "derivative_filter",
     "measurement_filter": "measurement_filter",
 }  # fmt: skip
-NOTCH = ("frequency", "damping", "width")
+# Parameters of the notches, and what they are where there is none.
+NOTCH = {"frequency": 0.0, "damping": 0.0, "width": 1.0}
 
 
 @dataclass(frozen=True)
@@ -35,7 +36,7 @@ class TunedGains:
             lines.append(f"# Several values are in the order of the axes {', '.join(names)}.")
         lines += ["/**:", "  ros__parameters:", f"    output_rate: {_number(self.rate)}"]
         # Notches first: set one after the other on a running node, no gain is without them.
-        for part, none in zip(NOTCH, (0.0, 0.0, 1.0), strict=True):
+        for part, none in NOTCH.items():
             for name, own in self.axes.items():
                 values = [getattr(notch, part) for notch in own.notches] or [none]
                 lines.append(f"    notch_{part}.{name}: [{', '.join(map(_number, values))}]")
@@ -54,19 +55,16 @@ class TunedGains:
         names = names or ["x"]
         try:
             rate = _numbers(found, "output_rate", 1)[0]
-            each = {parameter: _numbers(found, parameter, len(names), 0.0) for parameter in NUMBERS}
-            axes = {
-                name: PidGains(
-                    **{NUMBERS[parameter]: values[k] for parameter, values in each.items()},
-                    notches=_notches(found, name),
-                )
-                for k, name in enumerate(names)
-            }
             if not (isfinite(rate) and rate > 0.0):
                 raise UsageError(f"output_rate is {rate}; give the rate of the loop, hertz")
-            for gains in axes.values():
-                for notch in gains.notches:
-                    notch.require_below(rate)
+            each = {parameter: _numbers(found, parameter, len(names), 0.0) for parameter in NUMBERS}
+            axes = {}
+            for k, name in enumerate(names):
+                frequencies, dampings, widths = (
+                    _numbers(found, f"notch_{part}.{name}", 0, none) for part, none in NOTCH.items()
+                )
+                own = {NUMBERS[parameter]: values[k] for parameter, values in each.items()}
+                axes[name] = PidGains(**own, notches=notches_of(name, frequencies, dampings, widths, rate))
         except UsageError as error:
             raise UsageError(f"{path}: {error}") from None
         return cls(rate, axes)
@@ -108,13 +106,3 @@ def _numbers(found: Mapping[str, Any], name: str, count: int, default: float | N
     if count and len(several) != count:
         raise UsageError(f"{name} has {len(several)} values for {count} axes; give one for each")
     return [float(v) for v in several]
-
-
-def _notches(found: Mapping[str, Any], axis: str) -> tuple[Notch, ...]:
-    parts = [_numbers(found, f"notch_{part}.{axis}", 0, v) for part, v in zip(NOTCH, (0.0, 0.0, 1.0), strict=True)]
-    count = len(parts[0])
-    for part, several in zip(NOTCH, parts, strict=True):
-        if len(several) not in (1, count):
-            raise UsageError(f"notch_{part}.{axis} has {len(several)} values for {count} notches; give one for each")
-    filled = (several * count if len(several) == 1 else several for several in parts)
-    return tuple(Notch(*each) for each in zip(*filled, strict=True) if each[0])

@@ -1,5 +1,6 @@
 """Filter of the feedback: notches and a first-order low pass, in discrete time."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from math import exp, isfinite, pi, tan
 from typing import NamedTuple
@@ -52,6 +53,30 @@ class Notch:
             middle,
             (1.0 - 2.0 * self.width * k + square) / whole,
         )
+
+
+def notches_of(
+    axis: str, frequencies: Sequence[float], dampings: Sequence[float], widths: Sequence[float], rate: float
+) -> tuple[Notch, ...]:
+    """Return the notches of an axis from lists of numbers, one value or one for each; a frequency of 0 is none.
+
+    UsageError for numbers of another count, or a notch that is not below half the rate (Hz) of the loop.
+    """
+    filled = []
+    for name, several in (("damping", dampings), ("width", widths)):
+        if len(several) not in (1, len(frequencies)):
+            raise UsageError(
+                f"notch_{name}.{axis} has {len(several)} values, notch_frequency.{axis} has {len(frequencies)}; give "
+                "one value, or one for each notch"
+            )
+        filled.append(several if len(several) == len(frequencies) else [*several] * len(frequencies))
+    try:
+        found = tuple(Notch(*each) for each in zip(frequencies, *filled, strict=True) if each[0])
+        for notch in found:
+            notch.require_below(rate)
+    except UsageError as error:
+        raise UsageError(f"axis '{axis}': {error}") from None
+    return found
 
 
 @dataclass(frozen=True)

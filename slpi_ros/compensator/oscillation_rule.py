@@ -223,11 +223,10 @@ class OscillationRule(Rule):
                     self.noticed = self.noticed or found.amplitude > float(error.std())
                     if elapsed >= seconds and self._lasts(t, error, found):
                         return found
-                every = spectrum.erratic()
                 if (
                     fast
                     and elapsed >= seconds
-                    and self._stands_out(every)
+                    and self._stands_out(every := spectrum.erratic())
                     and self._is_slow(t, setpoint, every)
                     and self._lasts(t, error, every)
                     and Spectrum.of(t, moved).amplitude(every) >= (1.0 - LEAST_MARGIN) * every.amplitude

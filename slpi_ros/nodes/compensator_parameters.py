@@ -7,7 +7,7 @@ from math import nan
 from typing import Any
 
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
-from slpi_ros.compensator.loop_filter import Notch
+from slpi_ros.compensator.loop_filter import Notch, notches_of
 from slpi_ros.compensator.motion import Safety
 from slpi_ros.compensator.ownership import STARTS
 from slpi_ros.compensator.validation import TimestampRules
@@ -283,23 +283,8 @@ class CompensatorSettings:
 def _notches(values: Mapping[str, Any]) -> list[tuple[Notch, ...]]:
     """Return the notches of each axis; UsageError for numbers of another count, or above half of output_rate."""
     lists = (values[f"notch_{name}.AXIS"] for name in ("frequency", "damping", "width"))
-    found = []
-    for axis, frequencies, *others in zip(values["axes"], *lists, strict=True):
-        for name, several in zip(("damping", "width"), others, strict=True):
-            if len(several) not in (1, len(frequencies)):
-                raise UsageError(
-                    f"parameter notch_{name}.{axis} has {len(several)} values, notch_frequency.{axis} has "
-                    f"{len(frequencies)}; give one value, or one for each notch"
-                )
-        dampings, widths = (each * len(frequencies) if len(each) == 1 else each for each in others)
-        own = tuple(Notch(*each) for each in zip(frequencies, dampings, widths, strict=True) if each[0])
-        try:
-            for notch in own:
-                notch.require_below(values["output_rate"])
-        except UsageError as error:
-            raise UsageError(f"axis '{axis}': {error}") from None
-        found.append(own)
-    return found
+    each = zip(values["axes"], *lists, strict=True)
+    return [notches_of(axis, f, d, w, values["output_rate"]) for axis, f, d, w in each]
 
 
 def _starts(values: Mapping[str, Any]) -> tuple[str | float, ...]:

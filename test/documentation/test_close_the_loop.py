@@ -8,7 +8,7 @@ import pytest
 
 pytest.importorskip("rclpy")
 
-from documentation.pages import DOCS, Reader, steps_of  # noqa: E402
+from documentation.pages import DOCS, steps_of  # noqa: E402
 from nodes.ros_helpers import RELIABLE, on_graph, stage_model, started  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
@@ -26,14 +26,6 @@ from slpi_ros.simulation.parameters import AxisParameters  # noqa: E402
 MODE, DAMPING, DELAY = 110.0, 0.04, 5e-3
 STAGE = {"rate": 1000.0, "answer_commands": False, "resonance": MODE, "damping": DAMPING, "delay": DELAY, "seed": 3}
 DESIRED = 5e-6
-
-
-@pytest.fixture
-def reader(tmp_path, installed):
-    installed("compensator")
-    reader = Reader(tmp_path)
-    yield reader
-    reader.close()
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ import pytest
 rclpy = pytest.importorskip("rclpy")
 
 from diagnostic_msgs.msg import DiagnosticArray  # noqa: E402
-from documentation.pages import DOCS, Reader, steps_of  # noqa: E402
+from documentation.pages import DOCS, steps_of  # noqa: E402
 from rclpy.time import Time  # noqa: E402
 from sensor_msgs.msg import JointState  # noqa: E402
 
@@ -53,14 +53,6 @@ class Watcher:
         self.executor.shutdown()
         self.node.destroy_node()
         rclpy.shutdown(context=self.context)
-
-
-@pytest.fixture
-def reader(tmp_path, installed):
-    installed("compensator")
-    reader = Reader(tmp_path)
-    yield reader
-    reader.close()
 
 
 @pytest.fixture

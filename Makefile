@@ -79,7 +79,7 @@ help:
 	@echo 'make bench-faults   mutated files, node lives under faults, half an hour at 1 kHz, a day at accelerated time; 90 minutes'
 	@echo 'make audit      known vulnerabilities of the pinned dependencies, by pip-audit'
 	@echo 'make bench-learning  paths that repeat on stages of other physics, beside feedback and another learning; 20 minutes; LEARNING="--count 40 --all-paths"'
-	@echo 'make bench-loop-rate  crossover of the closed loop with 10, 100 and 1,000 commands a second, a minute'
+	@echo 'make bench-loop-rate  crossover of the closed loop with 10, 100 and 1,000 commands a second, two minutes'
 	@echo 'make bench-recorder  processor time of the recorder at 2 kHz, and what it loses when it is killed, 3 minutes; RECORDER="--beside PYTHON"'
 	@echo 'make bench-tune     30 stages identified and tuned without a hand: bandwidth, margin, detuned modes, a raster; half an hour'
 	@echo 'make bench-oscillation  feedback that oscillates and feedback that is well tuned: what is switched off, and when; six minutes'

@@ -2,7 +2,8 @@
 
 A simulated stage stands still at a desired displacement that its model misses. When feedback is switched on, an
 integral gain takes the error away exponentially, at the crossover of the loop. The stage starts anew for each rate, so
-that it moves along the same branch.
+that it moves along the same branch. Times are the stamps of the stage: this process is too busy to tell when a reading
+was made.
 """
 
 import argparse
@@ -17,6 +18,8 @@ from pathlib import Path
 sys.path.append(str(Path(__file__).resolve().parents[1] / "test"))
 
 import numpy as np
+import rclpy
+from builtin_interfaces.msg import Time
 from nodes.ros_helpers import RELIABLE, on_graph, stage_model, started
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -27,8 +30,15 @@ RATES = (10.0, 100.0, 1000.0)
 # Where the stage is sent (m), and the integral gain (V/(m s)): about 20 rad/s for 0.1 um/V.
 DESIRED, INTEGRAL = 5e-6, 2e8
 SETTLING, SECONDS = 2.0, 1.0
+# States that wait to be read, at most.
+KEPT = 5000
 # The part of the decay that is fitted, of the error at the begin.
 PART = (0.8, 0.1)
+
+
+def seconds(stamp: Time) -> float:
+    """Return the time (s) of a stamp, since a day began."""
+    return stamp.sec % 86400 + stamp.nanosec * 1e-9
 
 
 def crossover(rate: float, model_file: str) -> tuple[float, float]:
@@ -46,12 +56,11 @@ def crossover(rate: float, model_file: str) -> tuple[float, float]:
     ):
         graph.tested = compensator
         desired = graph.publisher(JointState, "/desired_displacement", RELIABLE)
-        states: list[tuple[float, float]] = []
-        graph.node.create_subscription(
-            JointState, "/stage_state", lambda state: states.append((time.monotonic(), state.position[0])), 1000
-        )
+        # Read at the end: an executor would take a core for the states.
+        reader = rclpy.create_node("reader", context=graph.node.context)
+        states = reader.create_subscription(JointState, "/stage_state", lambda state: None, KEPT)
         voltages: list[Float64MultiArray] = []
-        graph.node.create_subscription(Float64MultiArray, "/voltage_command", voltages.append, 1000)
+        listening = graph.node.create_subscription(Float64MultiArray, "/voltage_command", voltages.append, 1)
         ends = threading.Event()
 
         def send() -> None:
@@ -68,19 +77,23 @@ def crossover(rate: float, model_file: str) -> tuple[float, float]:
             # The compensator looks first who else is there.
             while not voltages:
                 graph.spin_for(0.1)
-            graph.spin_for(SETTLING)
+            graph.node.destroy_subscription(listening)
+            time.sleep(SETTLING)
             assert simulator.process.poll() is None
-            before = len(states)
+            begun = seconds(graph.node.get_clock().now().to_msg())
             assert graph.set_parameters("/compensator", feedback=True) == ""
-            graph.spin_for(SECONDS)
+            time.sleep(SECONDS)
         finally:
             ends.set()
             sender.join()
-    t, y = np.array(states[max(before - 200, 0) :]).T
+        with states.handle:
+            taken = iter(lambda: states.handle.take_message(JointState, False), None)
+            t, y = np.array([(seconds(state.header.stamp), state.position[0]) for state, _ in taken]).T
+        reader.destroy_node()
     error = np.abs(y - DESIRED)
-    first = float(np.median(error[:100]))
+    first = float(np.median(error[(t < begun) & (t > begun - 0.2)]))
     # From where the error has begun to fall, until it is near the noise.
-    inner = np.flatnonzero((error < PART[0] * first) & (error > PART[1] * first))
+    inner = np.flatnonzero((t > begun) & (error < PART[0] * first) & (error > PART[1] * first))
     inner = inner[inner < inner[0] + int(np.argmax(error[inner[0] :] < PART[1] * first))]
     return -float(np.polyfit(t[inner], np.log(error[inner]), 1)[0]), first
 
@@ -103,5 +116,5 @@ def main(repeats: int) -> None:
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--repeats", type=int, default=3)
+    parser.add_argument("--repeats", type=int, default=5)
     main(parser.parse_args().repeats)

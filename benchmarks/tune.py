@@ -115,8 +115,12 @@ class Stage:
         added: np.ndarray,
         noise: bool,
         scale: float,
+        known: bool = False,
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return true displacement and reading (m), (N,) each, at the readings; `added` (m, (M,)) repeats on these."""
+        """Return true displacement and reading (m), (N,) each, at the readings; `added` (m, (M,)) repeats on these.
+
+        The path is sent as single set points, or, if it is `known`, as a trajectory.
+        """
         quiet = self.parameters if noise else replace(self.parameters, noise_rms=0.0, quantisation=0.0)
         axis = SimulatedAxis(quiet, self.seed, replace(self.character, resonance=self.character.resonance * scale))
         period_ns = round(SECOND_NS / self.rate)
@@ -138,16 +142,28 @@ class Stage:
                     axis.step((arrives_ns - before - begin_ns) * 1e-9 + 1.0, v)
             return axis.step((at_ns - begin_ns) * 1e-9 + 1.0, v)
 
-        for k in range(round(seconds * self.rate)):
-            now_ns = begin_ns + k * period_ns
-            t = k * period_ns * 1e-9
-            # The correction from the last reading, with the next setpoint; then a reading of the stage.
-            made.update(now_ns, ["x"], [path(t)], now_ns)
+        def output(now_ns: int) -> None:
+            nonlocal v
             if made.axes[0].output.voltage != v:
                 moved(now_ns)
                 v = made.axes[0].output.voltage
                 moved(now_ns)
                 arriving.append(now_ns + delay_ns)
+
+        steps = np.arange(round(seconds * self.rate))
+        if known:
+            places = [[path(t)] for t in (steps * period_ns * 1e-9).tolist()]
+            made.follow(["x"], steps * period_ns, places, begin_ns, begin_ns - period_ns, begin_ns - period_ns)
+        for k in steps.tolist():
+            now_ns = begin_ns + k * period_ns
+            # The correction from the last reading, with the next setpoint; then a reading of the stage.
+            while known and (due_ns := made.next_due_ns(now_ns, now_ns)) is not None and due_ns <= now_ns:
+                due_ns = max(due_ns, now_ns - period_ns + period_ns // 50)
+                made.advance(due_ns, due_ns)
+                output(due_ns)
+            if not known:
+                made.update(now_ns, ["x"], [path(k * period_ns * 1e-9)], now_ns)
+                output(now_ns)
             at_ns = now_ns + period_ns // 50
             x = moved(at_ns)
             y = (axis.measure(x) if noise else x) + (float(added[k % added.size]) if added.size else 0.0)
@@ -253,8 +269,9 @@ def judged(seed: int) -> dict[str, float]:
         )
 
     errors = []
-    for gains in (PidGains(0.0), PidGains(0.0, rule / g), tuned.gains):
-        x, _ = stage.closed(model, gains, 1.0 + seconds, path, none, True, 1.0)
+    three = (PidGains(0.0), PidGains(0.0, rule / g), tuned.gains)
+    for gains, planned in [(each, way) for way in (False, True) for each in three]:
+        x, _ = stage.closed(model, gains, 1.0 + seconds, path, none, True, 1.0, planned)
         t = np.arange(x.size) / stage.rate
         error = x - np.array([path(each) for each in t])
         errors.append(float(np.sqrt(np.mean(error[t >= 1.0] ** 2))))
@@ -269,6 +286,7 @@ def judged(seed: int) -> dict[str, float]:
         "bandwidth": bandwidth, "predicted": tuned.bandwidth, "ratio": bandwidth / today,
         "margin": float(1.0 / size.max()), "stable": stable,
         "feedforward": errors[0], "rule": errors[1], "tuned": errors[2],
+        "known_feedforward": errors[3], "known_rule": errors[4], "known_tuned": errors[5],
         "seconds": made - known, "identified": known - begun,
     }  # fmt: skip
 
@@ -317,7 +335,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return 0
     print(
         " seed  mode/Hz damping delay/ms rate/Hz | bandwidth/Hz (predicted) over today's rule, margin, stable of 2 | "
-        "raster, nm rms: feedforward, today's rule, tuned", flush=True,
+        "raster, nm rms: feedforward, today's rule, tuned | the same as a trajectory", flush=True,
     )  # fmt: skip
     found = []
     for seed in range(options.first, options.first + options.count):
@@ -327,19 +345,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
             f"{seed:5d} {one['mode']:8.0f} {one['damping']:7.3f} {one['delay'] * 1e3:8.2f} {one['rate']:7.0f} | "
             f"{one['bandwidth']:6.1f} ({one['predicted']:.1f}) {one['ratio']:6.1f} "
             f"{one['margin']:5.2f} {one['stable']} | "
-            f"{one['feedforward'] * 1e9:7.1f} {one['rule'] * 1e9:7.1f} {one['tuned'] * 1e9:7.1f} "
+            f"{one['feedforward'] * 1e9:7.1f} {one['rule'] * 1e9:7.1f} {one['tuned'] * 1e9:7.1f} | "
+            f"{one['known_feedforward'] * 1e9:7.1f} {one['known_rule'] * 1e9:7.1f} {one['known_tuned'] * 1e9:7.1f} "
             f"| {one['identified']:.0f} + {one['seconds']:.1f} s", flush=True,
         )  # fmt: skip
     ratio, margin, stable = (np.array([one[name] for one in found]) for name in ("ratio", "margin", "stable"))
-    forward, rule, tuned = (np.array([one[name] for one in found]) for name in ("feedforward", "rule", "tuned"))
     n, less = len(found), np.sum(ratio >= 2.5)
     print(
         f"bandwidth over today's rule: median {np.median(ratio):.1f}, 2.5 or more {less}, below 1 {np.sum(ratio < 1)}"
     )
     print(f"modulus margin 0.45 or more: {np.sum(margin >= 0.45)} of {n}")
     print(f"stable with the mode 10 % off: {np.sum(stable == 2)} of {n}")
-    print(f"raster: at most half of feedforward {np.sum(tuned <= 0.5 * forward)} of {n}")
-    print(f"raster: above 1.2 times today's rule {np.sum(tuned > 1.2 * rule)} of {n}")
+    for way, prefix in (("raster of single set points", ""), ("raster as a trajectory", "known_")):
+        forward, rule, tuned = (
+            np.array([one[prefix + name] for one in found]) for name in ("feedforward", "rule", "tuned")
+        )
+        print(
+            f"{way}: at most half of feedforward {np.sum(tuned <= 0.5 * forward)} of {n}, above 1.2 times today's rule "
+            f"{np.sum(tuned > 1.2 * rule)}"
+        )
     return 0
 
 

@@ -287,12 +287,15 @@ class Axis:
         if not low <= y <= high:
             raise implausible(y, (low, high), kind)
 
-    def update(self, ahead: float | None, y: float, now_ns: int) -> float:
-        """Return the voltage (V) for the desired displacement `y` (m), `ahead` (s) after the last one by its stamp."""
+    def update(self, ahead: float | None, y: float, now_ns: int, early: bool = False) -> float:
+        """Return the voltage (V) for the desired displacement `y` (m), `ahead` (s) after the last one by its stamp.
+
+        `early`: it is output before its time by the delay of the stage.
+        """
         dt = self.samples.sample(ahead, now_ns, self.output.period)
         self.tracking.desired, self.tracking.learned = y, 0.0
         self.path.sample(dt, y)
-        v = self._sample(dt, y, now_ns)
+        v = self._sample(dt, y, now_ns, early)
         follow(self, now_ns, now_ns + SOONEST_HOLD_NS)
         return v
 
@@ -324,12 +327,13 @@ class Axis:
             self.output.start(voltages[-1])
         self.samples.given_ns = now_ns
 
-    def _sample(self, dt: float, y: float, now_ns: int) -> float:
+    def _sample(self, dt: float, y: float, now_ns: int, early: bool = False) -> float:
         """Output and return the voltage (V) for the desired displacement `y` (m), `dt` (s) after the last step."""
         v = self._output(dt, y, self.stream.move(dt, y, now_ns), now_ns)
         self.initial.assumed = None
         if self.loop.closed:
-            self.loop.setpoint(y, now_ns)
+            assert self.model
+            self.loop.setpoint(y, now_ns, max(round(self.model.chain.delay * SECOND_NS), 0) if early else 0)
         if self.uncertainty.on:
             self.uncertainty.sample(dt, y, v)
         return v

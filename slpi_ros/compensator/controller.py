@@ -384,8 +384,12 @@ class Controller:
         displacements: Sequence[float],
         aheads: Sequence[float | None],
         now_ns: int,
+        early: bool = False,
     ) -> tuple[bool, bool]:
-        """Move each axis to its displacement (m), `aheads` (s) after its last sample; return (held, slew limited)."""
+        """Move each axis to its displacement (m), `aheads` (s) after its last sample; return (held, slew limited).
+
+        `early`: before its time, by the delay of its stage.
+        """
         if self._stage:
             self._stage.decouple(dict(zip(names, displacements, strict=True)))
             for axis in self.axes:
@@ -393,7 +397,7 @@ class Controller:
         held = slewing = began = False
         for axis, y, ahead in zip(axes, displacements, aheads, strict=True):
             was_held = axis.held
-            axis.update(ahead, y, now_ns)
+            axis.update(ahead, y, now_ns, early)
             held, slewing = held or axis.held, slewing or axis.slewing
             began = began or (axis.held and not was_held)
         self.counts["excursions"] += began
@@ -498,7 +502,7 @@ class Controller:
         for axis in axes:
             axis.end_ramp(now_ns)
         aheads = [axis.samples.point(point.deadline_ns) for axis in axes]
-        held, slewing = self._move(axes, point.names, point.displacements, aheads, now_ns)
+        held, slewing = self._move(axes, point.names, point.displacements, aheads, now_ns, early=True)
         if not point.between:
             self.counts["points_held_at_limit"] += held
             self.counts["points_slew_limited"] += slewing

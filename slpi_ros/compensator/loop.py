@@ -54,7 +54,8 @@ class Loop:
         self._refusal: Callable[[PidGains, float], str] = lambda gains, period: ""
         # Measured - model, with the time (ns), also where the measurement is refused.
         self._offsets: deque[tuple[int, float]] = deque(maxlen=OFFSETS)
-        # Setpoint and displacement of the model as a sensor with delay or lag reads them; None without these.
+        # Setpoint and displacement of the model as a sensor with delay or lag reads them; None without these. Points of
+        # a trajectory are output earlier by the delay of the stage.
         self._setpoint: Sensed | None = None
         self._expected: Sensed | None = None
         self._corrected_ns = 0  # begin of the last period with a correction
@@ -102,7 +103,8 @@ class Loop:
             rule.span, rule.noise = high - low, model.quality.floor_rms
         self._refusal = lru_cache(maxsize=4)(partial(loop_margin.refusal, model))
         self._sensor = model.streaming_sensor()
-        self._setpoint = Sensed(self._sensor, stream.uncoupled_displacement) if self._sensor.late else None
+        late = self._sensor.late or model.chain.delay > 0.0
+        self._setpoint = Sensed(self._sensor, stream.uncoupled_displacement) if late else None
         if self.closed:
             self._applied = continue_from(model, allowed, self._applied)
             self._forget_residuals()
@@ -275,10 +277,10 @@ class Loop:
             self.driven_ns, self._between = now_ns, 0.0
             self._expect(self._applied.drive(voltage, dt), now_ns)
 
-    def setpoint(self, y: float, now_ns: int) -> None:
-        """Take a setpoint (m) that has been output."""
+    def setpoint(self, y: float, now_ns: int, early_ns: int) -> None:
+        """Take a setpoint (m) that has been output, by `early_ns` before its time."""
         if self._setpoint:
-            self._setpoint.hold(y, now_ns)
+            self._setpoint.hold(y, now_ns, early_ns)
 
     def _expect(self, displacement: float, now_ns: int, anew: bool = True) -> None:
         """Set the displacement of the model (m) with which readings are compared from `now_ns` (ns) on."""

@@ -130,11 +130,15 @@ class Sensed:
         self._samples.clear()
         self._before = self._sensor.measure(displacement)
 
-    def hold(self, displacement: float, now_ns: int) -> None:
-        """Set the displacement (m) from `now_ns` (ns, not decreasing) on."""
-        samples = self._samples
-        reading = self._after(samples[-1], now_ns) if samples else self._before
-        samples.append((now_ns, self._sensor.measure(displacement), reading))
+    def hold(self, displacement: float, now_ns: int, early_ns: int = 0) -> None:
+        """Set the displacement (m) from `early_ns` after `now_ns` (ns, not decreasing) on, instead of any later one."""
+        samples, from_ns, goal = self._samples, now_ns + early_ns, self._sensor.measure(displacement)
+        while samples and samples[-1][0] > from_ns:
+            if samples[-1][1] == goal:
+                return
+            samples.pop()
+        reading = self._after(samples[-1], from_ns) if samples else self._before
+        samples.append((from_ns, goal, reading))
         self._drop(now_ns)
 
     def at(self, now_ns: int) -> float | None:

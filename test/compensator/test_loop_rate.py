@@ -8,6 +8,7 @@ from strategies import PI_CASE, axis_model
 
 from slpi_ros.compensator.controller import Controller
 from slpi_ros.compensator.feedback import LoopSettings, PidGains
+from slpi_ros.effects.delay import Delay
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.model.axis_model import Start
@@ -146,3 +147,39 @@ def test_a_late_answer_between_two_set_points_is_no_residual_while_feedback_goes
                 stage.publish()
     drift = stage.made.axes[0].loop.drift
     assert drift.samples == 500 and drift.rms < 1e-10
+
+
+@pytest.mark.parametrize("delay", [0.0, 7e-3])
+def test_the_delay_of_the_stage_is_no_error_along_a_trajectory_and_one_along_single_set_points(delay):
+    """Points of a trajectory are output earlier: a reading tells of those that the stage has come to."""
+    stage, whole = Stage(), StageModel({"x": replace(MODEL, effects=(Delay(delay),) if delay else ())})
+    stage.made.use_model(whole)
+    late = [stage.memory.displacement] * round(delay * 1e3)
+    places = 5e-6 + 2e-6 * np.sin(np.linspace(0.0, 4.0, 800))
+    stage.run(0.1, 100.0)
+    axis, errors = stage.made.axes[0], []
+
+    def along(k: int) -> None:
+        stage.now_ns = START + 10**9 + k * MS
+        while (due_ns := stage.made.next_due_ns(stage.now_ns, stage.now_ns)) is not None and due_ns <= stage.now_ns:
+            if stage.made.advance(stage.now_ns, stage.now_ns):
+                stage.publish()
+        late.append(stage.memory.displacement)
+        stage.made.measure(["x"], [late.pop(0)], stage.now_ns + MS // 2)
+        errors.append(axis.tracking.report().latest)
+
+    begin_ns = START + 10**9 + 20 * MS
+    stage.made.follow(["x"], np.arange(places.size) * MS, places[:, None], begin_ns, stage.now_ns, stage.now_ns)
+    for k in range(900):
+        along(k)
+    assert np.abs(errors).max() < 1e-11 and abs(axis.loop.correction) < 1e-4
+    for k in range(900, 1700):
+        stage.now_ns = START + 10**9 + k * MS
+        stage.send(float(places[k - 900]))
+        along(k)
+    assert (np.abs(errors).max() > 1e-8) == (delay > 0.0)
+    # And back to a trajectory from where it is, whose first points are due before the last single ones are reached.
+    stage.made.follow(["x"], [50 * MS, 100 * MS], [[5e-6], [5e-6]], 0, stage.now_ns, stage.now_ns)
+    for k in range(1700, 2800):
+        along(k)
+    assert abs(errors[-1]) < 1e-11

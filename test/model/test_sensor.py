@@ -166,6 +166,17 @@ def test_samples_that_are_sensed_are_forgotten():
     assert told.at(2_020_000_000) == pytest.approx(5e-6, abs=1e-18)
 
 
+def test_what_is_to_come_is_replaced_by_what_comes_before_it():
+    told = Sensed(StreamingSensor(Sensor(0.0, 0.0), ()), 0.0)
+    for k in range(5):
+        told.hold(1e-6 * k, 1000 * k, 10_000)
+    assert [told.at(each) for each in (9_999, 10_000, 12_500)] == [None, 0.0, 2e-6]
+    told.hold(4e-6, 12_600)  # the last one anew: it is on its way
+    assert told.at(13_500) == 3e-6
+    told.hold(9e-6, 13_600)
+    assert [told.at(each) for each in (13_600, 20_000)] == [9e-6, 9e-6]
+
+
 # Documents
 
 

@@ -59,6 +59,13 @@ def test_the_page_shows_stage_sensitivity_and_step(folder):
     assert trace(page.charts["step-x"], "error")[1][0] == 100.0
 
 
+def test_a_model_of_hysteresis_alone_is_told_to_be_no_reason_to_trust_the_loop(tmp_path, capsys):
+    slpi_ros.save_model(StageModel({"x": replace(X, effects=()), "y": Y}), tmp_path / "xy.json")
+    assert main(["tune", str(tmp_path / "xy.json"), "-o", str(tmp_path / "g.yaml")]) == 0
+    warned = [line for line in capsys.readouterr().out.splitlines() if "--for-response" in line]
+    assert len(warned) == 1 and warned[0].startswith("axis x")
+
+
 def test_one_axis_and_json(folder, capsys):
     arguments = ("tune", folder / "xy.json", "-o", folder / "y.yaml", "--axis", "y", "--json", "--margin", "0.6")
     assert main([str(each) for each in arguments]) == 0

@@ -12,6 +12,7 @@ from slpi_ros.compensator.feedback import Feedback, PidGains
 from slpi_ros.compensator.loop_design import Design
 from slpi_ros.diagnosis.step_answers import StepAnswer
 from slpi_ros.model.limits import Limits, RateLimiter
+from slpi_ros.model.sensor import StreamingSensor
 from slpi_ros.model.stage_model import StageModel
 
 # Steps about the middle, and a raster, as shares of the displacement range; time of each set point, and of a period of
@@ -52,6 +53,14 @@ def showing(settings: CalibrationSettings, model: StageModel) -> dict[str, Float
     }
 
 
+@dataclass(frozen=True)
+class AxisLoop:
+    """Gains of an axis, and its sensor, whose own errors are taken out of the readings."""
+
+    gains: PidGains
+    sensor: StreamingSensor
+
+
 class ClosedLoop:
     """The compensator's feedback around the voltages of a drive, on all axes; times: steady clock, ns.
 
@@ -59,16 +68,18 @@ class ClosedLoop:
     """
 
     def __init__(
-        self, gains: Sequence[PidGains], limits: Sequence[Limits], rate: float, voltages: Sequence[float]
+        self, loops: Sequence[AxisLoop], limits: Sequence[Limits], rate: float, voltages: Sequence[float]
     ) -> None:
-        each = zip(gains, limits, voltages, strict=True)
-        self._axes = [Feedback(own, RateLimiter(within, 1.0 / rate, v)) for own, within, v in each]
+        each = zip(loops, limits, voltages, strict=True)
+        self._axes = [Feedback(own.gains, RateLimiter(within, 1.0 / rate, v)) for own, within, v in each]
+        self._sensors = [own.sensor for own in loops]
 
     def measure(self, displacements: Sequence[float], now_ns: int) -> None:
         """Take the readings (m) of all axes, NaN: none."""
-        for feedback, y in zip(self._axes, displacements, strict=True):
+        for feedback, sensor, y in zip(self._axes, self._sensors, displacements, strict=True):
             if isfinite(y):
-                feedback.measure(y, now_ns)
+                # No delay or lag of the sensor is known in a calibration: they count as the stage's.
+                feedback.measure(sensor.correct(y), now_ns)
 
     def goals(self, voltages: Sequence[float], desired: Sequence[float], now_ns: int) -> list[float]:
         """Return the voltages (V) of the drive, corrected; `desired` (m), NaN: none."""
@@ -83,3 +94,8 @@ class ClosedLoop:
 def gains_of(found: Mapping[str, LoopResult]) -> dict[str, PidGains]:
     """Return the gains of each axis; none where there is no design."""
     return {name: one.design.gains if one.design else PidGains(0.0) for name, one in found.items()}
+
+
+def loops_of(found: Mapping[str, LoopResult], model: StageModel) -> dict[str, AxisLoop]:
+    """Return the loop of each axis."""
+    return {name: AxisLoop(gains, model.axis(name).streaming_sensor()) for name, gains in gains_of(found).items()}

@@ -9,11 +9,10 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.calibration.choice import next_drive
-from slpi_ros.calibration.closed_loop import LoopResult, gains_of, showing
+from slpi_ros.calibration.closed_loop import AxisLoop, LoopResult, loops_of, showing
 from slpi_ros.calibration.drives import SWEEP_SECONDS, checking, compensated, driven_so_far, exciting
 from slpi_ros.calibration.kept import FOLLOWS, naming, require_kept
 from slpi_ros.calibration.settings import CALIBRATION, CalibrationSettings
-from slpi_ros.compensator.feedback import PidGains
 from slpi_ros.compensator.loop_design import design
 from slpi_ros.compensator.plausible import implausible_noise, implausible_stroke
 from slpi_ros.diagnosis.result import Diagnosis
@@ -61,7 +60,7 @@ class Request:
     name: str
     drive: Drive
     desired: Mapping[str, FloatArray]  # m, (N,), at the samples of the drive; empty without compensator
-    gains: Mapping[str, PidGains] = field(default_factory=dict)  # of the feedback along the path; empty: none
+    loops: Mapping[str, AxisLoop] = field(default_factory=dict)  # feedback along the path; empty: none
 
 
 @dataclass(frozen=True)
@@ -197,7 +196,7 @@ class _Calibration:
         judged = [
             {axis: replace(error, goal=goals[axis]) for axis, error in errors.items()} for _, errors in self._verified
         ]
-        loops = self._tune(self._verified[-1][0]) if settings.tune else {}
+        loops = self._tune(self._verified[-1][0], diagnosis.extended) if settings.tune else {}
         model = _left_at(self._verified[-1][0], self._records[-1])
         return Outcome(settings, model, judged[-1], diagnosis, tuple(self._steps), why(judged, diagnosis, ended), loops)
 
@@ -223,11 +222,11 @@ class _Calibration:
         kind: str,
         drive: Drive,
         desired: Mapping[str, FloatArray],
-        gains: Mapping[str, PidGains] | None = None,
+        loops: Mapping[str, AxisLoop] | None = None,
     ) -> Recording:
         name = f"{len(self._steps) + 1:02d}_{kind}"
         self._begin(f"recording {name}")
-        recording = self._record(Request(name, drive, desired, gains or {}))
+        recording = self._record(Request(name, drive, desired, loops or {}))
         if recording.kept:
             fitted = kind not in (CHECK_DRIVE, SWEEP, LOOP_DRIVE)
             require_kept(recording.record, drive, self._settings, self._first, fitted=fitted)
@@ -314,13 +313,16 @@ class _Calibration:
         self._verified.append((model, errors))
         return errors
 
-    def _tune(self, model: StageModel) -> dict[str, LoopResult]:
-        """Design the feedback of each axis, and follow steps and a raster with it."""
+    def _tune(self, model: StageModel, diagnosed: StageModel) -> dict[str, LoopResult]:
+        """Design the feedback of each axis, and follow steps and a raster with it.
+
+        The model with the least error may know less of modes and delays than the one that was diagnosed.
+        """
         settings, found = self._settings, dict[str, LoopResult]()
         self._begin("tuning the feedback")
         for name in settings.axes:
             try:
-                made = design(model.axis(name), settings.rate)
+                made = design(diagnosed.axis(name), settings.rate)
                 told = f"bandwidth {made.bandwidth:.3g} Hz, modulus margin {made.margin:.2f} predicted"
                 found[name] = LoopResult(made, told)
             except SlpiError as none:
@@ -330,7 +332,7 @@ class _Calibration:
             model = with_present_zero(model, self._records)
             path = replace(settings, path=showing(settings, model))
             drive, desired = compensated(path, model, len(self._steps), self._records)
-            recording = self._recorded(LOOP_DRIVE, drive, desired, gains_of(found))
+            recording = self._recorded(LOOP_DRIVE, drive, desired, loops_of(found, model))
             for name, one in shown.items():
                 error = tracking_error(recording, name, model, settings.goal(self._repeatability[name]))
                 steps = step_answers(error.t, error.desired, error.error, model.axis(name).quality.floor_rms)

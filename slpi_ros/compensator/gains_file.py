@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
+from sys import float_info
 from typing import Any
 
 from slpi_ros.compensator.feedback import PidGains
@@ -17,6 +18,7 @@ NUMBERS = {
     "kp": "proportional", "ki": "integral", "kd": "derivative", "derivative_filter": "derivative_filter",
     "measurement_filter": "measurement_filter",
 }  # fmt: skip
+LARGEST = float_info.max
 # Parameters of the notches, and what they are where there is none.
 NOTCH = {"frequency": 0.0, "damping": 0.0, "width": 1.0}
 
@@ -85,12 +87,12 @@ def _parameters(path: str) -> dict[str, Any]:
     try:
         with open_input(Path(path), METADATA_BYTES) as file:
             content = yaml.safe_load(file.read().decode())
-        nodes = [each["ros__parameters"] for each in content.values()]
+        nodes = [{name.strip(): v for name, v in each["ros__parameters"].items()} for each in content.values()]
         found: dict[str, Any] = {}
         for each in nodes:
             for name, value in each.items():
                 found |= {f"{name}.{key}": v for key, v in value.items()} if isinstance(value, dict) else {name: value}
-    except (OSError, UnicodeDecodeError, yaml.YAMLError, AttributeError, KeyError, TypeError) as error:
+    except (OSError, ValueError, yaml.YAMLError, AttributeError, KeyError, TypeError, RecursionError) as error:
         why = getattr(error, "strerror", None) or "no parameter file of a compensator"
         raise UsageError(f"{path}: {why}; give a file that slpi tune has written") from None
     if "output_rate" not in found:
@@ -101,8 +103,11 @@ def _parameters(path: str) -> dict[str, Any]:
 def _numbers(found: Mapping[str, Any], name: str, count: int, default: float | None = None) -> list[float]:
     given = found.get(name, default)
     several = given if isinstance(given, list) else [given] * (count or 1)
-    if not all(isinstance(v, int | float) and not isinstance(v, bool) for v in several):
-        raise UsageError(f"{name} is {given!r}; give numbers")
+    for v in several:
+        if not isinstance(v, int | float) or isinstance(v, bool) or abs(v) > LARGEST:
+            # Lists in lists, of few characters, may be of any length.
+            what = f"a {type(v).__name__} in a list" if isinstance(v, list | dict | set) else f"{v!r}"
+            raise UsageError(f"{name} is {what}; give finite numbers")
     if count and len(several) != count:
         raise UsageError(f"{name} has {len(several)} values for {count} axes; give one for each")
     return [float(v) for v in several]

@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
+from slpi_ros.calibration.closed_loop import AxisLoop
 from slpi_ros.calibration.kept import REMEDY
 from slpi_ros.calibration.run import Progress, Recording, Request, aligned, calibrate
 from slpi_ros.calibration.settings import CalibrationSettings
-from slpi_ros.compensator.feedback import PidGains
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.bag_reader import read_bag
 from slpi_ros.io.stage_name import stage_name
@@ -33,7 +33,7 @@ class Wanted:
     t: FloatArray  # s, (N,)
     voltage: FloatArray  # V, (N, axes)
     desired: FloatArray  # m, (N, axes), or (N, 0) if there is none
-    gains: tuple[PidGains, ...] = ()  # of the feedback along the path; none: without
+    loops: tuple[AxisLoop, ...] = ()  # feedback along the path; none: without
 
 
 # Settings, and the folder of bags and results.
@@ -78,7 +78,7 @@ def run_calibration(request: CalibrationRequest, node: Connection) -> Calibratio
         if not kept:
             columns = np.column_stack([*wanted.drive.voltage.values(), *wanted.desired.values()])
             voltage, desired = np.split(columns, [len(wanted.drive.voltage)], axis=1)
-            node.send(Wanted(wanted.name, wanted.drive.t, voltage, desired, tuple(wanted.gains.values())))
+            node.send(Wanted(wanted.name, wanted.drive.t, voltage, desired, tuple(wanted.loops.values())))
             node.recv()
         return replace(recording_of(output, wanted), kept=kept)
 

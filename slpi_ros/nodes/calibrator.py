@@ -267,7 +267,7 @@ class Calibrator(Node):
             self.get_logger().info(f"step {said.step}: {said.doing}; {said.seconds_left:.0f} s of drives left{error}")
         elif isinstance(said, Wanted):
             settings, voltages = self._settings, self._guard.voltages
-            loop = ClosedLoop(said.gains, settings.limits, settings.rate, voltages) if said.gains else None
+            loop = ClosedLoop(said.loops, settings.limits, settings.rate, voltages) if said.loops else None
             self._job = _Job(said, self._output, settings.axes, self._fail, loop)
             self._stepped = time.monotonic()
             self._guard.begin()

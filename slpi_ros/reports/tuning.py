@@ -27,6 +27,15 @@ REST = Quantity("error", "% of the step", 100.0, ".2f")
 AGREE = "#eef4f1"
 # Points of a curve over frequency.
 POINTS = 1500
+MODES = (
+    "A peak is a mode: there the stage rings, and the notch takes the feedback out. Grey: that mode 10 % lower and "
+    "higher, with which the loop keeps its margin, too. "
+)
+MEASURED_TOO = "Dots are measured; shaded: where model and measurement agree but for a constant factor. "
+UNKNOWN = (
+    "the model knows neither mode nor lag nor delay, and a loop of this bandwidth may be unstable on the stage; give a "
+    "record of slpi excite --for-response, or a model of slpi diagnose"
+)
 HELP = {
     "mode": "a stiffer or better damped mount, or less load, moves that",
     "delay": "a faster sensor, driver or link moves that",
@@ -42,9 +51,10 @@ def describe(axis: AxisModel, found: Design) -> list[str]:
     ]
     if gains.measurement_filter:
         filters.append(f"measurement_filter {gains.measurement_filter * 1e3:.3g} ms")
+    detuned = f"each mode {DETUNING:.0%} off and " if any(effect.ringing for effect in axis.effects) else ""
     return [
-        f"bandwidth {found.bandwidth:.3g} Hz of small motions, modulus margin {found.margin:.2f} with each mode "
-        f"{DETUNING:.0%} off and the slope of the largest loop",
+        f"bandwidth {found.bandwidth:.3g} Hz of small motions, modulus margin {found.margin:.2f} with {detuned}the "
+        "slope of the largest loop",
         f"ki {gains.integral:.3g} V/(m s), kp {gains.proportional:.3g} V/m{''.join(f', {each}' for each in filters)}",
         f"a step of a tenth of the stroke, by feedback alone, is within 1 % after {_time(_settling(axis, found)[0])}, "
         f"within the noise after {_time(_settling(axis, found)[1])}",
@@ -54,9 +64,10 @@ def describe(axis: AxisModel, found: Design) -> list[str]:
 
 
 def describe_measured(found: Design, measured: FrequencyResponse | None) -> list[str]:
-    """Return where a measured response and the model agree, as lines of text."""
+    """Return where a measured response and the model agree, or that nothing is known of it, as lines of text."""
     if measured is None:
-        return []
+        plant = found.plant
+        return [] if plant.delay or len(plant.dynamics.b) else [UNKNOWN]
     model = found.plant.response(2.0 * pi * measured.frequency)
     band = measured.agreement(model)
     where = f"agree from {band[0]:.3g} to {band[1]:.4g} Hz" if band else "agree nowhere"
@@ -179,10 +190,9 @@ def _show(page: Page, name: str, axis: AxisModel, found: Design, measured: Frequ
     page.chart(
         f"bode-{name}", bode,
         "How many nanometres the reading moves for each volt, and by how much it is late (360 degrees: a whole "
-        "period). A peak is a mode: there the stage rings, and the notch takes the feedback out. Grey: that mode 10 % "
-        "lower and higher, with which the loop keeps its margin, too. Dots are measured. "
+        f"period). {MODES if corners else ''}{MEASURED_TOO if measured else ''}"
         f"Small motions have less slope than large ones, {loop.large:.2g} times as much in the largest loop, for which "
-        "the margin is kept. Shaded: where model and measurement agree but for a constant factor.",
+        "the margin is kept.",
     )  # fmt: skip
     sensitivity = Chart([Panel(FREQUENCY, SENSITIVITY)], "column", 380)
     for each, label, colour, width in (

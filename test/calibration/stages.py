@@ -43,7 +43,7 @@ class SimulatedRecorder:
         drive = request.drive
         rows = np.column_stack(list(drive.voltage.values())).tolist()
         t = (self.now + drive.t).tolist()
-        if request.gains:
+        if request.loops:
             rows, y = self._followed(request, t, rows)
         else:
             y = np.array([self.stage.measure(self.stage.step(at, row)) for at, row in zip(t, rows, strict=True)])
@@ -57,7 +57,7 @@ class SimulatedRecorder:
     def _followed(self, request, t, rows):
         """Return voltages and readings with feedback, each from the reading before."""
         count = len(rows[0])
-        loop = ClosedLoop(list(request.gains.values()), settings("xyz"[:count]).limits, RATE, rows[0])
+        loop = ClosedLoop(list(request.loops.values()), settings("xyz"[:count]).limits, RATE, rows[0])
         desired = np.column_stack(list(request.desired.values())).tolist()
         sent, readings = [], []
         for at, row, wanted in zip(t, rows, desired, strict=True):

@@ -1,17 +1,20 @@
 """Tuned feedback in a calibration: the path that shows it, the loop around a drive, and all of it on a stage."""
 
 import math
+import pickle
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from calibration.stages import SimulatedRecorder, settings, stage_of
 from strategies import PI_CASE, axis_model
 
-from slpi_ros.calibration.closed_loop import STEPS, ClosedLoop, showing
+from slpi_ros.calibration.closed_loop import STEPS, AxisLoop, ClosedLoop, showing
 from slpi_ros.calibration.run import calibrate
 from slpi_ros.compensator.feedback import PidGains
 from slpi_ros.compensator.gains_file import TunedGains
 from slpi_ros.diagnosis.step_answers import step_answers
+from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports.calibration import GAINS, write_files
@@ -33,14 +36,17 @@ def test_each_axis_shows_its_steps_while_the_others_rest():
 
 
 def test_readings_correct_the_drive_along_its_path_only():
-    gains = [PidGains(0.0, 20.0 / SLOPE), PidGains(0.0)]
-    loop = ClosedLoop(gains, [Limits(0.0, 100.0)] * 2, RATE, [50.0, 50.0])
+    # A sensor that reads too much by a wave of 20 nm, as the model knows.
+    wave = SensorPeriodic(3e-7, 2e-8, 1.0)
+    sensor = replace(axis_model(PI_CASE), effects=(wave,)).streaming_sensor()
+    loops = [AxisLoop(PidGains(0.0, 20.0 / SLOPE), sensor), AxisLoop(PidGains(0.0), sensor)]
+    loop = ClosedLoop(pickle.loads(pickle.dumps(loops)), [Limits(0.0, 100.0)] * 2, RATE, [50.0, 50.0])
     sent = []
     for k in range(600):
         # Feedforward is 1 V off.
         desired = 51.0 * SLOPE if 100 <= k < 400 else math.nan
         sent.append(loop.goals([50.0, 50.0], [desired, desired], k * 5_000_000 + 1))
-        loop.measure([SLOPE * v for v in sent[-1]], k * 5_000_000 + 2)
+        loop.measure([sensor.measure(SLOPE * v) for v in sent[-1]], k * 5_000_000 + 2)
     x, y = np.array(sent).T
     assert np.all(x[:100] == 50.0) and x[399] == pytest.approx(51.0, abs=1e-6)
     assert np.all(np.abs(np.diff(x)) < 0.2) and x[-1] == pytest.approx(50.0, abs=1e-3)
@@ -58,7 +64,7 @@ def test_a_calibration_with_tuning_shows_its_loop_on_the_stage(tmp_path):
     assert [each.count for each in loop.steps] == [2, 2]
     # Feedback takes creep and hysteresis out before the next step.
     assert all(each.quiet is not None for each in loop.steps)
-    assert recorder.requests[-1].gains["x"] == loop.design.gains
+    assert recorder.requests[-1].loops["x"].gains == loop.design.gains
     assert outcome.seconds <= outcome.settings.budget
     write_files(tmp_path, outcome)
     assert TunedGains.read(str(tmp_path / GAINS)) == TunedGains(RATE, {"x": loop.design.gains})

@@ -182,6 +182,13 @@ def test_gains_come_back_from_their_file(tmp_path):
         assert TunedGains.read(path) == tuned
 
 
+# Eight lists of nine of the list before: 43 million numbers.
+BOMB = "/**:\n  ros__parameters:\n    output_rate: 1000.0\n    a: &a 1.0\n"
+for before, name in zip("abcdefgh", "bcdefghi", strict=True):
+    BOMB += f"    {name}: &{name} [{', '.join(['*' + before] * 9)}]\n"
+BOMB += "    ki: *i\n"
+
+
 @pytest.mark.parametrize(
     "text",
     [
@@ -191,6 +198,11 @@ def test_gains_come_back_from_their_file(tmp_path):
         "/**:\n  ros__parameters:\n    output_rate: 100.0\n    notch_frequency.x: [60.0]\n",
         "/**:\n  ros__parameters:\n    output_rate: 999.0\n    notch_frequency.x: [6.0]\n    notch_width.x: [1, 2]\n",
         "/**:\n  ros__parameters:\n    output_rate: 1000.0\n    ki: [1.0, 2.0]\n",
+        "/**:\n  ros__parameters:\n    output_rate: 1000.0\n    5: 1.0\n",
+        f"/**:\n  ros__parameters:\n    output_rate: 1000.0\n    ki: 1{'0' * 400}\n",
+        f"/**:\n  ros__parameters:\n    output_rate: 1000.0\n    ki: {'9' * 6000}\n",
+        f"/**:\n  ros__parameters:\n    output_rate: 1000.0\n    ki: {'[' * 1000}{']' * 1000}\n",
+        BOMB,
     ],
 )  # fmt: skip
 def test_a_file_without_gains_is_named_in_one_line(tmp_path, text):
@@ -198,6 +210,6 @@ def test_a_file_without_gains_is_named_in_one_line(tmp_path, text):
     path.write_text(text)
     with pytest.raises(UsageError) as caught:
         TunedGains.read(str(path))
-    assert str(path) in str(caught.value) and "\n" not in str(caught.value)
+    assert str(path) in str(caught.value) and "\n" not in str(caught.value) and len(str(caught.value)) < 1000
     with pytest.raises(UsageError):
         TunedGains.read(str(tmp_path / "none.yaml"))

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from math import isfinite
+from math import isfinite, nan
 
 import numpy as np
 
@@ -10,7 +10,12 @@ from slpi_ros.arrays import FloatArray
 from slpi_ros.calibration.settings import CalibrationSettings
 from slpi_ros.compensator.feedback import Feedback, PidGains
 from slpi_ros.compensator.loop_design import Design
+from slpi_ros.compensator.loop_margin import refusal
+from slpi_ros.compensator.monitor import Finding
+from slpi_ros.compensator.oscillation_rule import OscillationRule
 from slpi_ros.diagnosis.step_answers import StepAnswer
+from slpi_ros.errors import UsageError
+from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.limits import Limits, RateLimiter
 from slpi_ros.model.sensor import StreamingSensor
 from slpi_ros.model.stage_model import StageModel
@@ -22,6 +27,8 @@ STEPS, RASTER, HOLD, PERIOD, PERIODS = (0.02, 0.1), 0.3, 1.0, 1.0, 2
 SLEW_USED = 0.4
 # Age from which a reading is ignored, seconds.
 TIMEOUT = 0.3
+# Time between two looks for an oscillation.
+CHECK_NS = 50_000_000
 
 
 @dataclass(frozen=True)
@@ -55,40 +62,95 @@ def showing(settings: CalibrationSettings, model: StageModel) -> dict[str, Float
 
 @dataclass(frozen=True)
 class AxisLoop:
-    """Gains of an axis, and its sensor, whose own errors are taken out of the readings."""
+    """Gains of an axis, and what the loop has to know of it."""
 
     gains: PidGains
-    sensor: StreamingSensor
+    sensor: StreamingSensor  # its own errors are taken out of the readings
+    slope: float  # m/V
+    span: float  # m
+    noise: float  # m
+
+    @classmethod
+    def of(cls, gains: PidGains, axis: AxisModel) -> "AxisLoop":
+        """Return the loop of an axis."""
+        (low, high), (first, last) = axis.displacement_range, axis.voltage_range
+        slope = (high - low) / (last - first)
+        return cls(gains, axis.streaming_sensor(), slope, high - low, axis.quality.floor_rms)
 
 
 class ClosedLoop:
     """The compensator's feedback around the voltages of a drive, on all axes; times: steady clock, ns.
 
-    It corrects where there is a desired displacement; after that the correction decays.
+    It corrects where there is a desired displacement; after that the correction decays. An oscillation that it sustains
+    switches it off, which is then in `off`.
     """
 
     def __init__(
-        self, loops: Sequence[AxisLoop], limits: Sequence[Limits], rate: float, voltages: Sequence[float]
+        self,
+        loops: Sequence[AxisLoop],
+        limits: Sequence[Limits],
+        rate: float,
+        voltages: Sequence[float],
+        names: Sequence[str] = (),
     ) -> None:
-        each = zip(loops, limits, voltages, strict=True)
-        self._axes = [Feedback(own.gains, RateLimiter(within, 1.0 / rate, v)) for own, within, v in each]
-        self._sensors = [own.sensor for own in loops]
+        each = zip(loops, limits, voltages, names or [""] * len(loops), strict=True)
+        self._axes = [_Corrected(own, RateLimiter(within, 1.0 / rate, v), name) for own, within, v, name in each]
+
+    @property
+    def off(self) -> str:
+        """Why feedback of an axis was switched off; "": it was not."""
+        return "; ".join(str(axis.off) for axis in self._axes if axis.off)
 
     def measure(self, displacements: Sequence[float], now_ns: int) -> None:
         """Take the readings (m) of all axes, NaN: none."""
-        for feedback, sensor, y in zip(self._axes, self._sensors, displacements, strict=True):
+        for axis, y in zip(self._axes, displacements, strict=True):
             if isfinite(y):
-                # No delay or lag of the sensor is known in a calibration: they count as the stage's.
-                feedback.measure(sensor.correct(y), now_ns)
+                axis.measure(y, now_ns)
 
     def goals(self, voltages: Sequence[float], desired: Sequence[float], now_ns: int) -> list[float]:
         """Return the voltages (V) of the drive, corrected; `desired` (m), NaN: none."""
-        return [self._step(*each, now_ns) for each in zip(self._axes, voltages, desired, strict=True)]
+        return [axis.step(v, y, now_ns) for axis, v, y in zip(self._axes, voltages, desired, strict=True)]
 
-    def _step(self, feedback: Feedback, voltage: float, desired: float, now_ns: int) -> float:
-        on = isfinite(desired) and bool(feedback.gains.integral)
+
+class _Corrected:
+    """Feedback of one axis, and the rule that listens to it."""
+
+    def __init__(self, loop: AxisLoop, pace: RateLimiter, name: str) -> None:
+        self._loop, self._feedback = loop, Feedback(loop.gains, pace)
+        self._rule = OscillationRule(loop.span, loop.noise, name)
+        self._desired, self._held, self._checked_ns = nan, False, 0
+        self.off: Finding | None = None
+
+    def measure(self, y: float, now_ns: int) -> None:
+        # No delay or lag of the sensor is known in a calibration: they count as the stage's.
+        x = self._loop.sensor.correct(y)
+        self._feedback.measure(x, now_ns)
+        if isfinite(self._desired):
+            moved = self._loop.slope * self._feedback.correction
+            self._rule.take(x - self._desired, self._desired, moved, now_ns)
+
+    def step(self, voltage: float, desired: float, now_ns: int) -> float:
+        feedback, rule, self._desired = self._feedback, self._rule, desired
+        on = isfinite(desired) and bool(feedback.gains.integral) and not self.off
+        rule.watch(on, now_ns)
+        if on and now_ns - self._checked_ns >= CHECK_NS:
+            self._checked_ns, self.off = now_ns, rule.check(now_ns)
+        if self._held and not rule.held:
+            feedback.forget()
+        self._held, on = rule.held, on and not self.off
         feedback.switch(on)
-        return feedback.step(desired, voltage, now_ns, TIMEOUT) if on else feedback.hold(now_ns, voltage)
+        if not on:
+            return feedback.hold(now_ns, voltage)
+        return feedback.step(desired, voltage, now_ns, None if rule.held else TIMEOUT)
+
+
+def too_slow(axis: AxisModel, gains: PidGains, period: float) -> bool:
+    """Return whether a loop that was computed once in a period (s) is not stable enough to be judged."""
+    try:
+        return bool(refusal(axis, gains, period))
+    except UsageError:
+        # A notch above half that rate.
+        return True
 
 
 def gains_of(found: Mapping[str, LoopResult]) -> dict[str, PidGains]:
@@ -98,4 +160,4 @@ def gains_of(found: Mapping[str, LoopResult]) -> dict[str, PidGains]:
 
 def loops_of(found: Mapping[str, LoopResult], model: StageModel) -> dict[str, AxisLoop]:
     """Return the loop of each axis."""
-    return {name: AxisLoop(gains, model.axis(name).streaming_sensor()) for name, gains in gains_of(found).items()}
+    return {name: AxisLoop.of(gains, model.axis(name)) for name, gains in gains_of(found).items()}

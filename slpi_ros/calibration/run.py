@@ -9,7 +9,7 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.calibration.choice import next_drive
-from slpi_ros.calibration.closed_loop import AxisLoop, LoopResult, loops_of, showing
+from slpi_ros.calibration.closed_loop import AxisLoop, LoopResult, loops_of, showing, too_slow
 from slpi_ros.calibration.drives import SWEEP_SECONDS, checking, compensated, driven_so_far, exciting
 from slpi_ros.calibration.kept import FOLLOWS, naming, require_kept
 from slpi_ros.calibration.settings import CALIBRATION, CalibrationSettings
@@ -51,6 +51,7 @@ class Recording:
     record: Record
     desired: Mapping[str, FloatArray]  # m, (N,), NaN where there was none; empty without compensator
     kept: bool = False
+    off: str = ""  # why feedback was switched off, if it was
 
 
 @dataclass(frozen=True)
@@ -335,9 +336,16 @@ class _Calibration:
             recording = self._recorded(LOOP_DRIVE, drive, desired, loops_of(found, model))
             for name, one in shown.items():
                 error = tracking_error(recording, name, model, settings.goal(self._repeatability[name]))
+                t = without_held(recording.record, name)[0].t
+                rate = (t.size - 1) / (t[-1] - t[0])
+                assert one.design
+                if too_slow(diagnosed.axis(name), one.design.gains, 1.0 / rate):
+                    told = f"{one.told}; not shown on the stage: {rate:.3g} readings a second came, a busy computer"
+                    found[name] = replace(one, told=told)
+                    continue
                 steps = step_answers(error.t, error.desired, error.error, model.axis(name).quality.floor_rms)
-                told = f"{one.told}; on the stage {error.told()}"
-                found[name] = replace(one, told=told, steps=steps)
+                off = f"; feedback was switched off: {recording.off}" if recording.off else ""
+                found[name] = replace(one, told=f"{one.told}; on the stage {error.told()}{off}", steps=steps)
             self._records.append(recording.record)
         finding = "; ".join(f"axis {name}: {one.told}" for name, one in found.items())
         name, seconds = (self._records[-1].source, float(drive.t[-1])) if shown else ("tune", 0.0)

@@ -58,10 +58,10 @@ class CalibrationJob(WorkerProcess[CalibrationRequest, Progress | Wanted | Calib
         what = "calibrator: the computation"
         super().__init__(run_calibration, (settings, output), CalibrationOutcome, what, talks=True)
 
-    def recorded(self) -> None:
-        """Tell the worker that its drive is recorded; one that has died is told by `outcome`."""
+    def recorded(self, off: str) -> None:
+        """Tell the worker that its drive is recorded, and why feedback was switched off; `outcome` tells of its end."""
         with suppress(BrokenPipeError, ConnectionResetError):
-            self.connection.send(None)
+            self.connection.send(off)
 
 
 def run_calibration(request: CalibrationRequest, node: Connection) -> CalibrationOutcome:
@@ -79,8 +79,8 @@ def run_calibration(request: CalibrationRequest, node: Connection) -> Calibratio
             columns = np.column_stack([*wanted.drive.voltage.values(), *wanted.desired.values()])
             voltage, desired = np.split(columns, [len(wanted.drive.voltage)], axis=1)
             node.send(Wanted(wanted.name, wanted.drive.t, voltage, desired, tuple(wanted.loops.values())))
-            node.recv()
-        return replace(recording_of(output, wanted), kept=kept)
+        off = "" if kept else node.recv()
+        return replace(recording_of(output, wanted), kept=kept, off=off)
 
     try:
         outcome = calibrate(settings, record, node.send)

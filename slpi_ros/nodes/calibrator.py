@@ -267,7 +267,8 @@ class Calibrator(Node):
             self.get_logger().info(f"step {said.step}: {said.doing}; {said.seconds_left:.0f} s of drives left{error}")
         elif isinstance(said, Wanted):
             settings, voltages = self._settings, self._guard.voltages
-            loop = ClosedLoop(said.loops, settings.limits, settings.rate, voltages) if said.loops else None
+            of = settings.limits, settings.rate, voltages, settings.axes
+            loop = ClosedLoop(said.loops, *of) if said.loops else None
             self._job = _Job(said, self._output, settings.axes, self._fail, loop)
             self._stepped = time.monotonic()
             self._guard.begin()
@@ -302,7 +303,7 @@ class Calibrator(Node):
         self._guard.end()
         job.close(interrupted=self._failure is not None)
         if self._failure is None and self._worker is not None:
-            self._worker.recorded()
+            self._worker.recorded(job.loop.off if job.loop else "")
 
     # What is watched
 

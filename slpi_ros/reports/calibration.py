@@ -12,7 +12,7 @@ from slpi_ros.reports import diagnosis as diagnosis_files
 from slpi_ros.reports.chart import AFTER, BEFORE, DESIRED, DISPLACEMENT, TIME, Chart, Panel, Quantity, thin_line
 from slpi_ros.reports.page import Page
 from slpi_ros.reports.text import describe_model
-from slpi_ros.reports.tuning import describe
+from slpi_ros.reports.tuning import describe, describe_measured
 from slpi_ros.reports.verification import show_steps
 
 # The model, the page, the folder with the files of the last diagnosis, and the gains of a tuned loop.
@@ -70,7 +70,7 @@ def page_of(outcome: Outcome) -> Page:
         page.heading(f"Feedback of axis {axis}", f"{axis}-loop")
         page.text(f"At {outcome.settings.rate:g} Hz, in {GAINS}: {loop.told}.")
         if loop.design:
-            page.lines(describe(outcome.model.axis(axis), loop.design))
+            page.lines([*describe(outcome.model.axis(axis), loop.design), *describe_measured(loop.design, None)])
         show_steps(page, axis, loop.steps)
     page.heading("What was recorded, why, and what it showed")
     rows = [

@@ -411,6 +411,8 @@ def show_steps(page: Page, name: str, steps: Sequence[StepAnswer]) -> None:
         ],
         caption="Steps of the set point by their size; of each size the worst.",
     )
+    if all(each.settled is None and each.quiet is None for each in steps):
+        return
     chart = Chart([Panel(STEP_SIZE, SETTLING)], "column", 300)
     sizes = np.array([each.size for each in steps])
     for label, times, colour in (

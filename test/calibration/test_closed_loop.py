@@ -9,11 +9,14 @@ import pytest
 from calibration.stages import SimulatedRecorder, settings, stage_of
 from strategies import PI_CASE, axis_model
 
-from slpi_ros.calibration.closed_loop import STEPS, AxisLoop, ClosedLoop, showing
+from slpi_ros.calibration.closed_loop import STEPS, AxisLoop, ClosedLoop, showing, too_slow
 from slpi_ros.calibration.run import calibrate
 from slpi_ros.compensator.feedback import PidGains
 from slpi_ros.compensator.gains_file import TunedGains
+from slpi_ros.compensator.loop_design import design
 from slpi_ros.diagnosis.step_answers import step_answers
+from slpi_ros.effects.filters import Mode
+from slpi_ros.effects.resonance import Resonance
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
@@ -38,8 +41,9 @@ def test_each_axis_shows_its_steps_while_the_others_rest():
 def test_readings_correct_the_drive_along_its_path_only():
     # A sensor that reads too much by a wave of 20 nm, as the model knows.
     wave = SensorPeriodic(3e-7, 2e-8, 1.0)
-    sensor = replace(axis_model(PI_CASE), effects=(wave,)).streaming_sensor()
-    loops = [AxisLoop(PidGains(0.0, 20.0 / SLOPE), sensor), AxisLoop(PidGains(0.0), sensor)]
+    model = replace(axis_model(PI_CASE), effects=(wave,))
+    sensor = model.streaming_sensor()
+    loops = [AxisLoop.of(PidGains(0.0, ki), model) for ki in (20.0 / SLOPE, 0.0)]
     loop = ClosedLoop(pickle.loads(pickle.dumps(loops)), [Limits(0.0, 100.0)] * 2, RATE, [50.0, 50.0])
     sent = []
     for k in range(600):
@@ -51,7 +55,26 @@ def test_readings_correct_the_drive_along_its_path_only():
     assert np.all(x[:100] == 50.0) and x[399] == pytest.approx(51.0, abs=1e-6)
     assert np.all(np.abs(np.diff(x)) < 0.2) and x[-1] == pytest.approx(50.0, abs=1e-3)
     # An axis without gains has no feedback.
-    assert np.all(y == 50.0)
+    assert np.all(y == 50.0) and not loop.off
+
+
+def test_an_oscillation_that_it_sustains_switches_it_off():
+    """As with readings that are 50 ms late, which the gains are not made for."""
+    model = axis_model(PI_CASE)
+    loop = ClosedLoop([AxisLoop.of(PidGains(0.0, 50.0 / SLOPE), model)], [Limits(0.0, 100.0)], RATE, [50.0], ["x"])
+    late, sent = [50.0] * 10, []
+    for k in range(1200):
+        sent += loop.goals([50.0], [51.0 * SLOPE], k * 5_000_000 + 1)
+        late.append(sent[-1])
+        loop.measure([SLOPE * late.pop(0)], k * 5_000_000 + 2)
+    assert loop.off.startswith("axis 'x': it oscillated at")
+    assert np.ptp(sent[:600]) > 20.0 and np.all(np.abs(np.array(sent[-100:]) - 50.0) < 1e-3)
+
+
+def test_a_loop_that_is_computed_too_seldom_shows_nothing_of_its_gains():
+    model = replace(axis_model(PI_CASE), effects=(Resonance((Mode(30.0, 0.1, 1.0),)),))
+    gains = design(model, RATE).gains
+    assert [too_slow(model, gains, period) for period in (1.0 / RATE, 1.2 / RATE, 0.1)] == [False, False, True]
 
 
 @pytest.mark.slow

@@ -340,7 +340,7 @@ class _Calibration:
                 rate = (t.size - 1) / (t[-1] - t[0])
                 assert one.design
                 if too_slow(diagnosed.axis(name), one.design.gains, 1.0 / rate):
-                    told = f"{one.told}; not shown on the stage: {rate:.3g} readings a second came, a busy computer"
+                    told = f"{one.told}; not shown on the stage: {rate:.3g} readings a second are too few for it"
                     found[name] = replace(one, told=told)
                     continue
                 steps = step_answers(error.t, error.desired, error.error, model.axis(name).quality.floor_rms)

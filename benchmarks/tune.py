@@ -295,8 +295,8 @@ def judged(seed: int) -> dict[str, float]:
 def response_judged(stage: Stage) -> tuple[int, float, float, float]:
     """Return lines up to twice the mode, shares with an interval of 5 %, of these within 5 % and 5 degrees, in theirs.
 
-    The truth is mode, delay and creep; the slope, which depends on the amplitude, is the measured one. The slowest lines,
-    which move the stage most, have up to 5 % more of it by the hysteresis alone.
+    The truth is mode, delay and creep; the slope, which depends on the amplitude, is the measured one. The slowest
+    lines, which move the stage most, have up to 5 % more of it by the hysteresis alone.
     """
     found, character = stage.measured(), stage.character
     mode = Resonance((Mode(character.resonance, character.damping, 1.0),))

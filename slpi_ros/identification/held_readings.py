@@ -97,7 +97,9 @@ def held_readings(y: FloatArray, v: FloatArray) -> Held:
     if share < HELD or best - max(fresh) < _BETTER * changed.size:
         return none
     # A run that is longer than usual is of several readings with the same digits.
-    return _with_fresh(y, float(np.mean(runs[runs <= max(1.5 * np.median(runs), 2.0)])))
+    rows = float(np.mean(runs[runs <= max(1.5 * np.median(runs), 2.0)]))
+    # Where most runs are shorter the repeats are those of a stage at rest.
+    return _with_fresh(y, rows) if 1.0 - 1.0 / rows >= HELD else none
 
 
 def _regular(runs: NDArray[np.intp]) -> int:

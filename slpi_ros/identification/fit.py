@@ -96,7 +96,9 @@ def identify(
         for part, (one, at) in zip(records, selected, strict=True):
             stamps = part.time_ns[at]
             times.append((stamps - stamps[0]) * 1e-9)
-            rates.append(fastest(times[-1][one.fitted], one.v[one.fitted]))
+            if np.median(np.diff(stamps)) > 0.0:
+                # Else nothing can be said of time.
+                rates.append(fastest(times[-1][one.fitted], one.v[one.fitted]))
             release(part.time_ns)
         try:
             # The matrices are small: one thread is fastest.
@@ -126,7 +128,7 @@ def identify(
                         whole, _ = select_thinned(records[last], axis, None, None, FIT_SAMPLES)
                     model = replace(model, end=replace(model, start=fitted.starts[last]).after(whole.v))
                 quality = _with_statistics(model, fitted.starts, times, samples)
-                models[axis] = replace(model, sensor=sensor, quality=replace(quality, fastest=max(rates)))
+                models[axis] = replace(model, sensor=sensor, quality=replace(quality, fastest=max(rates, default=None)))
         except SlpiError as error:
             raise type(error)(f"{source}: axis '{axis}': {error}") from None
     return StageModel(models, hardware_id, datetime.now(UTC).isoformat(timespec="seconds"))

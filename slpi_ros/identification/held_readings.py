@@ -3,6 +3,7 @@
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy.special import ndtr
 
 from slpi_ros.arrays import FloatArray, Mask
@@ -12,7 +13,6 @@ from slpi_ros.io.record import Record
 
 # Share of repeated rows, beyond those that are equal by their digits, from which readings are held: one row in three
 # where a sensor's readings last for one or two rows.
-
 HELD = 0.3
 # Log-likelihood of the held readings above that of fresh ones, for each change of the readings.
 _BETTER = 0.7
@@ -49,9 +49,9 @@ class Held:
 def held_readings(y: FloatArray, v: FloatArray) -> Held:
     """Find the readings of a displacement (m) that are fresh, at voltages (V), both finite, of shape (N,).
 
-    Equal readings in a row also come from coarse digits. Two explanations of all changes from row to row are compared
-    by their likelihood: fresh readings with noise and digits, of a stage that moves at its speed; or readings of which
-    a share repeats the one before, so that a change follows all of the motion since the last one.
+    Equal readings in a row also come from coarse digits. Explanations of all changes from row to row are compared by
+    their likelihood: fresh readings with noise and digits, of a stage that moves at its speed; or readings of which a
+    share repeats the one before, or all but every k-th one, so that a change follows all of the motion since the last.
     """
     none = Held(np.ones(y.size, dtype=bool), 1.0)
     same = y[1:] == y[:-1]
@@ -59,7 +59,9 @@ def held_readings(y: FloatArray, v: FloatArray) -> Held:
     if y.size < FEWEST or at.size < FEWEST // 4 or np.count_nonzero(same) <= HELD * same.size or not np.ptp(v):
         return none
     rows = same.size / at.size
-    step = digit(y) or _CONTINUOUS * median_rms(y[at + 1] - y[at])
+    moves = y[at + 1] - y[at]
+    # Too few levels to tell the digits lie no closer than the smallest change.
+    step = digit(y) or max(_CONTINUOUS * median_rms(moves), float(np.abs(moves).min()))
     gain = spread(y) / spread(v)
     driven, ways = gain / step * np.diff(v), _speeds(y, round(_READINGS * rows)) / step
     slowest = np.where(np.abs(driven) < np.abs(ways), driven, ways)
@@ -84,11 +86,27 @@ def held_readings(y: FloatArray, v: FloatArray) -> Held:
         _told(nothing, slowest[equal], noise) + _told(sizes, driven[changed], noise, ways[changed]) for noise in _NOISES
     ]
     best, share = max(_best_share(since[equal], sizes, since[changed], noise) for noise in _NOISES)
+    runs = changed - before[changed]
+    every = _regular(runs)
+    new, met = (equal - before[equal]) % every == 0, runs % every == 0
+    nothing, since_still, since_change = nothing[new], since[equal[new]], since[changed[met]]
+    regular = max(
+        _told(nothing, since_still, noise) + _told(sizes[met], since_change, noise) for noise in _NOISES
+    ) + np.count_nonzero(~met) * np.log(_ELSE)
+    best, share = max((best, share), (float(regular), 1.0 - 1.0 / every))
     if share < HELD or best - max(fresh) < _BETTER * changed.size:
         return none
     # A run that is longer than usual is of several readings with the same digits.
-    runs = changed - before[changed]
-    return _with_fresh(y, float(np.mean(runs[runs <= max(1.5 * np.median(runs), 2.0)])))
+    rows = float(np.mean(runs[runs <= max(1.5 * np.median(runs), 2.0)]))
+    # Where most runs are shorter the repeats are those of a stage at rest.
+    return _with_fresh(y, rows) if 1.0 - 1.0 / rows >= HELD else none
+
+
+def _regular(runs: NDArray[np.intp]) -> int:
+    """Return the number of rows of which the rows from change to change, (K,), are multiples in most cases."""
+    # That one of k phases is met by chance is the less likely the larger k is.
+    tried = range(2, max(2, int(2.0 * np.median(runs))) + 1)
+    return max(tried, key=lambda every: np.count_nonzero(runs % every == 0) * np.log(every))
 
 
 def _with_fresh(y: FloatArray, rows: float) -> Held:

@@ -456,7 +456,9 @@ def _drive_findings(quality: Quality) -> Iterator[Finding]:
         if drive.usual_step < _JUMPS:
             yield Finding("stop", f"{text}, as the voltage jumps from hold to hold: drive ramps, which show the loops")
             return
-        yield Finding("stop", f"{text}: record {rate:.2g} samples per second or more, all of them, or drive slower")
+        yield Finding(
+            "stop", f"{text}: record {float(f'{rate:.2g}'):g} samples per second or more, all of them, or drive slower"
+        )
         return
     yield _warn_if(
         drive.covered < _FEW_PAIRS,

@@ -143,11 +143,6 @@ def _connection(topic: str, msgtype: str, encoding: str, count: int, number: int
     return Connection(topic, "/".join([parts[0], "msg", parts[1]] if short else parts), encoding, count, number)
 
 
-def has_bounded_chunks(file: BinaryIO) -> None:
-    """Raise an error if the chunks of an MCAP file without a summary unpack to more than any recording."""
-    McapFile(file)
-
-
 class McapFile:
     """Reader of a complete MCAP file; any exception if it is damaged."""
 

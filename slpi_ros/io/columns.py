@@ -88,6 +88,8 @@ Reader = Callable[[Sequence[str]], Mapping[str, FloatArray]]
 FEWEST_FOR_A_LINE, AS_NOISE = 20, 1.5
 # Word by which the name of a column says that its displacement is a desired one.
 _DESIRED = re.compile(r"(?<![^\W\d_])(?:desired|set[ _-]?point)(?![^\W\d_])", re.IGNORECASE)
+# Names of columns of time: of LabVIEW, of MATLAB, and of a sampling period.
+_TIMES = ("X_Value", "x_value", "t", "ts", "Ts")
 _INDEX_OF_A_MATRIX = re.compile(r"\((?:\d+,:|:,\d+)\)$")
 _BRACKETS = re.compile(r"[(\[]([^()\[\]]*)[)\]]")
 _SEPARATED = re.compile(r"(?:\s+in\s+|\s*/\s+|\s+/\s*)(\S+)\s*$")
@@ -339,8 +341,7 @@ def times_in(names: Sequence[str]) -> list[str]:
     """Return the columns that hold times by their names."""
     found = [n for n in names if begins(n, TIME) or (unit_in(n, TIME) and axis_of(n, TIME).casefold() == "t")]
     with_unit = [n for n in names if unit_in(n, TIME) and not (begins(n, VOLTAGE) or begins(n, DISPLACEMENT))]
-    # LabVIEW's name of the column of time.
-    return found or (with_unit if len(with_unit) == 1 else [n for n in names if n.casefold() == "x_value"])
+    return found or (with_unit if len(with_unit) == 1 else [n for n in names if n in _TIMES])
 
 
 def two_clocks(source: str, one: str, other: str, names: Sequence[str]) -> str:

@@ -54,7 +54,7 @@ def in_order(
             told.append(f"{np.count_nonzero(wrong)} of {time.size} messages with a stamp out of order are left out")
             rows = rows[~wrong]
     if (at := first_step_back(time[rows])) is not None:
-        by = (int(time[rows[at - 1]]) - int(time[rows[at]])) * 1e-9
+        by = (int(time[rows[at - 1]]) - int(time[rows[at]]) + _usual_step(time[rows])) * 1e-9
         told.append(
             f"a clock was set back by {by:.4g} s at message {rows[at] + 1} of {time.size}; use the part before it "
             "(--stop), or record again"

@@ -17,6 +17,7 @@ FLOAT64 = "std_msgs/msg/Float64"
 SECOND_NS = 1_000_000_000
 # header stamps count seconds in int32
 _STAMP_END = 2**31 * SECOND_NS
+_XYZ = ("x", "y", "z")
 
 
 def _read_joint_state(reader: CdrReader) -> tuple[str, ...]:
@@ -24,11 +25,6 @@ def _read_joint_state(reader: CdrReader) -> tuple[str, ...]:
     for field in ("position", "velocity", "effort"):
         reader.doubles(field)
     return names
-
-
-def _read_number(reader: CdrReader) -> tuple[str, ...]:
-    reader.doubles("data", 1)
-    return ("0",)
 
 
 def _read_array(reader: CdrReader) -> tuple[str, ...]:
@@ -44,26 +40,15 @@ def _read_array(reader: CdrReader) -> tuple[str, ...]:
     return tuple(map(str, range(count)))
 
 
-def _read_vector(reader: CdrReader) -> tuple[str, ...]:
-    reader.doubles("vector", 3)
-    return ("x", "y", "z")
-
-
-def _read_wrench(reader: CdrReader) -> tuple[str, ...]:
-    reader.doubles("force", 3)
-    reader.doubles("torque", 3)
-    return ("x", "y", "z")
-
-
-def _measured(field: str) -> "MessageType":
-    """Return the type of a stamped measurement, with a variance after its value."""
+def _fixed(*fields: str, names: tuple[str, ...] = ("0",)) -> Callable[[CdrReader], tuple[str, ...]]:
+    """Return how fields are read that hold a number for each name."""
 
     def read(reader: CdrReader) -> tuple[str, ...]:
-        reader.doubles(field, 1)
-        reader.doubles("variance", 1)
-        return ("0",)
+        for field in fields:
+            reader.doubles(field, len(names))
+        return names
 
-    return MessageType(True, False, (field,), read)
+    return read
 
 
 @dataclass(frozen=True)
@@ -71,29 +56,32 @@ class MessageType:
     """Rules for decoding one message type."""
 
     stamped: bool  # begins with a header
-    named: bool  # columns have names, such as joint names; otherwise they are numbered
+    named: bool  # there may be several columns, which have names, such as joint names; otherwise they are numbered
     fields: tuple[str, ...]  # that contain the numbers
     read: Callable[[CdrReader], tuple[str, ...]]  # everything after the header; returns the names of the columns
-
-    @property
-    def several(self) -> bool:
-        """Whether a message may hold several numbers."""
-        return self.named
 
 
 MESSAGE_TYPES = {
     JOINT_STATE: MessageType(True, True, ("position", "effort"), _read_joint_state),
-    FLOAT64: MessageType(False, False, ("data",), _read_number),
+    FLOAT64: MessageType(False, False, ("data",), _fixed("data")),
     "std_msgs/msg/Float64MultiArray": MessageType(False, False, ("data",), _read_array),
-    "geometry_msgs/msg/Vector3Stamped": MessageType(True, True, ("vector",), _read_vector),
+    "geometry_msgs/msg/Vector3Stamped": MessageType(True, True, ("vector",), _fixed("vector", names=_XYZ)),
 }
 # Types of quantities that are recorded beside a stage.
 QUANTITY_TYPES = {
-    "sensor_msgs/msg/Temperature": _measured("temperature"),
-    "sensor_msgs/msg/RelativeHumidity": _measured("relative_humidity"),
-    "sensor_msgs/msg/FluidPressure": _measured("fluid_pressure"),
+    # A variance follows the value.
+    **{
+        f"sensor_msgs/msg/{name}": MessageType(True, False, (field,), _fixed(field, "variance"))
+        for name, field in (
+            ("Temperature", "temperature"),
+            ("RelativeHumidity", "relative_humidity"),
+            ("FluidPressure", "fluid_pressure"),
+        )
+    },
     FLOAT64: MESSAGE_TYPES[FLOAT64],
-    "geometry_msgs/msg/WrenchStamped": MessageType(True, True, ("force", "torque"), _read_wrench),
+    "geometry_msgs/msg/WrenchStamped": MessageType(
+        True, True, ("force", "torque"), _fixed("force", "torque", names=_XYZ)
+    ),
     JOINT_STATE: MESSAGE_TYPES[JOINT_STATE],
 }
 _KINDS = MESSAGE_TYPES | QUANTITY_TYPES
@@ -244,24 +232,32 @@ def decode_trajectory(data: bytes, field: str = "positions") -> TrajectoryArrays
         return None
 
 
-def _decode(data: bytes, field: str) -> TrajectoryArrays | None:
-    reader = CdrReader(data)
+def _read_head(reader: CdrReader) -> tuple[int, tuple[str, ...], int]:
+    """Read what is before the points of a JointTrajectory; return its stamp (ns), names, and the number of points."""
     start_ns = reader.integer("i") * SECOND_NS + reader.integer()
     reader.string()
-    names = reader.strings()
-    points = reader.integer()
+    return start_ns, reader.strings(), reader.integer()
+
+
+def _read_point(reader: CdrReader, field: str) -> int:
+    """Read a point of a JointTrajectory; return the number of values in a field."""
+    counts = {each: reader.doubles(each)[0] for each in ("positions", "velocities", "accelerations", "effort")}
+    reader.integer("i", "sec")
+    reader.integer("I", "nanosec")
+    return counts[field]
+
+
+def _decode(data: bytes, field: str) -> TrajectoryArrays | None:
+    reader = CdrReader(data)
+    start_ns, names, points = _read_head(reader)
     if points * SMALLEST_POINT > len(data):
         return None
     times, read = np.empty(points, np.int64), np.empty((points, len(names)), order="F")
     done = 0
     while done < points:
         begin = reader.at
-        for each in ("positions", "velocities", "accelerations", "effort"):
-            count, _ = reader.doubles(each)
-            if each == field and count != len(names):
-                return None
-        reader.integer("i", "sec")
-        reader.integer("I", "nanosec")
+        if _read_point(reader, field) != len(names):
+            return None
         size = reader.at - begin
         # Only the first point may have another alignment (offset modulo eight) than the points after it.
         alike = 1 if done == 0 else points - done
@@ -282,33 +278,18 @@ def encode_trajectory(
 
     Positions of shape (N, 0) are left out.
     """
-    seconds, rest = divmod(stamp_ns, SECOND_NS)
-    parts = [serialise(seconds, rest, "", len(names), *names, len(times_ns))]
+    point = [0.0] * positions.shape[1], (), (), [0.0] * effort.shape[1], 0, 0
+    template = serialise(*divmod(stamp_ns, SECOND_NS), "", len(names), *names, len(times_ns), *point, *point)
+    reader = CdrReader(template)
+    _read_head(reader)
+    parts = [template[: reader.at]]
     # Only the first point may begin at another place within eight bytes.
-    begin = (len(parts[0]) - 4) % 8
     for rows in (slice(0, 1), slice(1, None)):
-        layout = _point_layout(begin, positions.shape[1], effort.shape[1])
-        points = np.zeros(len(times_ns[rows]), layout)
+        begin = reader.at
+        _read_point(reader, "positions")
+        data = np.tile(np.frombuffer(template[begin : reader.at], np.uint8), len(times_ns[rows]))
+        points = data.view(reader.layout(begin).dtype(reader.at - begin))
         points["sec"], points["nanosec"] = np.divmod(times_ns[rows], SECOND_NS)
-        for name, values in (("positions", positions[rows]), ("effort", effort[rows])):
-            if values.shape[1]:
-                points[f"{name}_count"], points[name] = values.shape[1], values
-        parts.append(points.tobytes())
-        begin = (begin + layout.itemsize) % 8
+        points["positions"], points["effort"] = positions[rows], effort[rows]
+        parts.append(data.tobytes())
     return b"".join(parts)
-
-
-def _point_layout(begin: int, positions: int, effort: int) -> np.dtype[np.void]:
-    """Return the layout of a point of a trajectory that begins `begin` bytes after a multiple of eight."""
-    fields: dict[str, tuple[str, int]] = {}
-    at = begin
-    for name, count in (("positions", positions), ("velocities", 0), ("accelerations", 0), ("effort", effort)):
-        fields[f"{name}_count"] = "<u4", at - begin
-        at += 4
-        if count:
-            at += -at % 8
-            fields[name] = f"({count},)<f8", at - begin
-            at += 8 * count
-    fields["sec"], fields["nanosec"] = ("<i4", at - begin), ("<u4", at + 4 - begin)
-    formats, offsets = zip(*fields.values(), strict=True)
-    return np.dtype({"names": list(fields), "formats": formats, "offsets": offsets, "itemsize": at + 8 - begin})

@@ -53,7 +53,7 @@ class Chosen(NamedTuple):
 
 def key_of(topic: str, field: str, msgtype: str) -> str:
     """Return the name of a quantity: its topic, and the field where the messages have several."""
-    return f"{topic}:{field}" if QUANTITY_TYPES[msgtype].several else topic
+    return f"{topic}:{field}" if QUANTITY_TYPES[msgtype].named else topic
 
 
 def topics_beside(types: Mapping[str, str], stage: str) -> list[str]:
@@ -79,7 +79,7 @@ def courses(signals: Signals, chosen: Chosen, msgtype: str, since_start: FloatAr
     """
     kind, order = QUANTITY_TYPES[msgtype], np.argsort(since_start, kind="stable")
     fields = {
-        f"{field}.{name}" if kind.several else field: column
+        f"{field}.{name}" if kind.named else field: column
         for field, columns in signals.fields.items()
         for name, column in columns.items()
     }
@@ -118,7 +118,7 @@ def value_of(data: bytes, msgtype: str, field: str) -> float | None:
         message = read_message(data, msgtype)
     except (struct.error, UnicodeDecodeError, MemoryError, LimitError):
         return None
-    if not kind_of(msgtype).several:
+    if not kind_of(msgtype).named:
         (values,) = message.values.values()
         return float(values[0])
     part, _, name = field.partition(".")

@@ -46,22 +46,8 @@ _COMMENT = re.compile(r"^\s*(?:[#%!]|//)+\s*")
 # A date, a date with a time of day, or a time of day.
 _WHEN = re.compile(r"\d{1,4}([-/.])\d{1,2}\1\d{1,4}(?:[T ]+\d.*)?|\d+:\d\d:\d\d(?:[.,]\d+)?(?: ?[AP]M)?", re.IGNORECASE)
 # How programs write that there is no number, beside an empty cell.
-_MISSING = (
-    "nan",
-    "NaN",
-    "NAN",
-    "-nan",
-    "-NaN",
-    "NA",
-    "N/A",
-    "n/a",
-    "#N/A",
-    "null",
-    "NULL",
-    "None",
-    "-nan(ind)",
-    "1.#QNAN",
-)
+_MISSING: tuple[str, ...] = ("nan", "NaN", "NAN", "-nan", "-NaN", "-nan(ind)", "1.#QNAN")
+_MISSING += ("NA", "N/A", "n/a", "#N/A", "null", "NULL", "None")
 _DAY, _HALF_A_DAY = 86_400.0, 43_200.0
 # Of a file of LabVIEW (.lvm), the sampling period where it has no column of time.
 _LABVIEW, _DELTA_X = "LabVIEW Measurement", re.compile(r"^Delta_X[\t,;]+([^\t,;\s]+)", re.MULTILINE)
@@ -183,13 +169,7 @@ class TextTable(Table):
                             **exact,
                         )
                     ]
-            except (
-                ValueError,
-                OverflowError,
-                pd.errors.ParserError,
-                pd.errors.ParserWarning,
-                pd.errors.EmptyDataError,
-            ):
+            except (ValueError, OverflowError, pd.errors.ParserWarning):
                 continue
             columns = [np.concatenate(column) for column in zip(*parts, strict=True)]
             # Cells that are missing are looked at line by line.

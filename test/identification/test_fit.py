@@ -262,3 +262,10 @@ def test_no_kind_is_fitted_to_a_mere_rise(kind):
     for v in (25.0 * t, np.where(t < 1, 0.0, 50.0)):
         with pytest.raises(IdentificationError, match="never turns back"):
             slpi_ros.identify(record_of(t, v, 2e-7 * v), kind)
+
+
+def test_no_rate_is_told_where_most_stamps_are_equal(recorded):
+    record, _ = recorded
+    coarse = replace(record, time_ns=record.time_ns // 10**8 * 10**8)
+    assert slpi_ros.identify(coarse, kind="pi").axes["x"].quality.fastest is None
+    assert slpi_ros.identify(record, kind="pi").axes["x"].quality.fastest > 0.0

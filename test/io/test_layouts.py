@@ -93,6 +93,8 @@ MATLAB = {
     "structure with labels": ({"ScopeData": {"time": T[:, None], "signals": SIGNALS}}, {}),
     "capture of dSPACE": ({"exp": DSPACE}, {}),
     "a period": ({"Ts": 0.005, "voltage": V, "position": Y}, {"time": "Ts"}),
+    "a period, by its name": ({"Ts": 0.005, "voltage": V, "position": Y}, {}),
+    "t": ({"t": T, "u_V": V, "x_um": Y}, {}),
 }  # fmt: skip
 
 

@@ -187,6 +187,11 @@ def _require_whole(file: Path, header: bytes) -> None:
         query = "SELECT name FROM sqlite_master WHERE type = 'view' OR sql LIKE 'CREATE VIRTUAL%' LIMIT 1"
         if found := base.execute(query).fetchone():
             raise LimitError(f"{file.name} has a view {found[0]!r}, which no recorder writes")
+        if not base.execute("SELECT 1 FROM sqlite_master WHERE name = 'messages'").fetchone():
+            raise RecordError(
+                f"{file}: it has no table of messages; if its recorder was killed, they are in {journal.name} beside "
+                "the original: copy both"
+            )
 
 
 def _remedy(source: Path) -> str:
@@ -213,14 +218,15 @@ def match_topic(topics: Mapping[str, str], topic: str, msgtypes: Collection[str]
     found = found or sorted(name for name in topics if absolute_name(name).endswith(wanted))
     if not found:
         raise RecordError(
-            f"{source}: no topic '{topic}'; the bag holds {contents}; name the right one (--topic; of desired "
-            "displacements --desired-topic)"
+            f"{source}: no topic '{topic}'; the bag holds {contents}; name the right one (--topic, or "
+            "--voltage-topic and --displacement-topic; of desired displacements --desired-topic)"
         )
     if len(found) > 1:
         raise RecordError(f"{source}: topic '{topic}' may be {' or '.join(found)}; give the full name")
     if topics[found[0]] not in msgtypes:
         raise RecordError(
-            f"{source}: topic '{found[0]}' is {topics[found[0]]}, not {' or '.join(msgtypes)}; the bag holds {contents}"
+            f"{source}: topic '{found[0]}' is {topics[found[0]]}, not {' or '.join(msgtypes)}: publish it as that, or "
+            f"name another; the bag holds {contents}"
         )
     return found[0]
 

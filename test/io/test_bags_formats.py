@@ -2,6 +2,8 @@
 
 import errno
 import shutil
+import sqlite3
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -100,6 +102,18 @@ def test_sqlite_with_messages_in_its_journal(tmp_path):
     bag = rosbags_bag(tmp_path / "bag", TOPICS, "sqlite3")
     (bag / "bag.db3-wal").write_bytes(b"messages")
     assert holds(refusal(RecordError, read_bag, bag), "bag.db3-wal", "wal_checkpoint")
+
+
+def test_sqlite_copied_without_its_journal(tmp_path):
+    # Until its first checkpoint a database that is written with a log ahead is a page without tables.
+    with closing(sqlite3.connect(tmp_path / "live.db3")) as base:
+        base.execute("PRAGMA journal_mode=WAL")
+        base.execute("CREATE TABLE messages(id INTEGER PRIMARY KEY, data BLOB)")
+        base.commit()
+        shutil.copy(tmp_path / "live.db3", tmp_path / "copy.db3")
+    told = str(refusal(RecordError, read_bag, tmp_path / "copy.db3"))
+    assert holds(told, tmp_path / "copy.db3", "copy.db3-wal")
+    assert ".recover" not in told
 
 
 @pytest.mark.parametrize("compression", CompressionType)

@@ -86,6 +86,9 @@ def _set_back(time: IntArray) -> int | None:
     """Return the message at which time goes back into what was recorded already; None if messages only came late."""
     for at in (np.flatnonzero(np.diff(time) < 0) + 1).tolist()[:_MOST_STEPS]:
         before, after = time[:at], time[at:]
+        # What came late leaves no pause that is longer than its own ones; a clock that was set far back does.
+        if before.min() - after.max() > max(np.abs(np.diff(part)).max(initial=0) for part in (before, after)):
+            return int(at) if min(before.size, after.size) > _SET_BACK else None
         low, high = max(before.min(), after.min()), min(before.max(), after.max())
         within = np.flatnonzero((time >= low) & (time <= high))
         # What came late, in one piece or singly, goes into a gap; after a step of the clock both take turns.

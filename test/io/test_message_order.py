@@ -89,7 +89,7 @@ def test_a_clock_that_was_set_back(tmp_path, back):
     record = read_bag(mcap(tmp_path / "bag.mcap", rows(stamps, stamps + 300_000)))
     np.testing.assert_array_equal(record.displacement["x"], Y)
     np.testing.assert_array_equal(record.time_ns, stamps)
-    assert any("set back" in note and "--stop" in note and holds(note, 451, back / 1e9) for note in record.notes)
+    assert any("set back" in note and "--stop" in note and holds(note, 451, f"{back / 1e9:g}") for note in record.notes)
     (error,) = assess_record(record, Source(records=[record])).refused.values()
     assert "--stop" in str(error)
 

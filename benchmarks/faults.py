@@ -129,7 +129,7 @@ def readers(folder: Path) -> dict[str, Reader]:
     found["model"] = (folder / "m.json").read_bytes(), ".json", lambda path: usable_model(load_model(path))
     save_memory(SavedMemory(model_id(model), False, {"x": SavedAxis((1.0, 5.0), True)}), folder / "s.json")
     found["saved memory"] = (folder / "s.json").read_bytes(), ".json", load_memory
-    message = encode_joint_states(record.time_ns[:1], np.zeros((1, 2)), np.zeros((1, 2)), tuple(AXES), "stage")[0]
+    message = next(encode_joint_states(record.time_ns[:1], np.zeros((1, 2)), np.zeros((1, 2)), tuple(AXES), "stage"))
     found["message"] = message, ".cdr", lambda path: from_bytes(path.read_bytes())
     return found
 

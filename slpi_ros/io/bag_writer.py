@@ -3,9 +3,12 @@
 import os
 import shutil
 import sqlite3
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from functools import cache
+from heapq import merge
+from itertools import repeat
+from operator import itemgetter
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -171,19 +174,19 @@ def write_bag(
     messages = encode_joint_states(record.time_ns, displacement, voltage, record.axes, record.hardware_id)
     # Readers sort by log time, which must not decrease: so the order of the record is kept where its stamps decrease.
     logged = np.maximum.accumulate(record.time_ns)
-    written = [(stamp, topic, message) for stamp, message in zip(logged.tolist(), messages, strict=True)]
+    written: list[Iterable[tuple[int, str, bytes]]] = [zip(map(int, logged), repeat(topic), messages, strict=False)]
     if desired:
         paths = np.column_stack([*desired.values()])
         wanted = encode_joint_states(record.time_ns, paths, np.full_like(paths, np.nan), tuple(desired))
-        written += [(stamp, DESIRED, message) for stamp, message in zip(logged.tolist(), wanted, strict=True)]
+        written.append(zip(map(int, logged), repeat(DESIRED), wanted, strict=False))
     beside = {key: course for key, course in record.surroundings.items() if ":" not in key}
     for key, (t, value) in beside.items():
         stamps = (int(record.time_ns[0]) + np.rint(t * 1e9).astype(np.int64)).tolist()
-        written += [(at, key, float64(each)) for at, each in zip(stamps, value.tolist(), strict=True)]
+        written.append(sorted((at, key, float64(each)) for at, each in zip(stamps, value.tolist(), strict=True)))
     with BagWriter(path, storage=storage, topic=topic, replace=replace) as bag:
         for name, kind in {**({DESIRED: JOINT_STATE} if desired else {}), **dict.fromkeys(beside, FLOAT64)}.items():
             bag.add_topic(name, kind)
-        for stamp, name, message in sorted(written, key=lambda one: one[0]):
+        for stamp, name, message in merge(*written, key=itemgetter(0)):
             bag.write(stamp, message, name)
 
 

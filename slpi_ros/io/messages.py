@@ -1,8 +1,9 @@
 """Decoding and encoding of serialised messages: JointState, JointTrajectory and other types of recorded signals."""
 
 import struct
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from slpi_ros.io.input_limits import MOST_AXES, LimitError, require_count
 JOINT_STATE, JOINT_TRAJECTORY = "sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"
 FLOAT64 = "std_msgs/msg/Float64"
 SECOND_NS = 1_000_000_000
+_AT_ONCE = 65_536  # messages that are encoded at once
 # header stamps count seconds in int32
 _STAMP_END = 2**31 * SECOND_NS
 _XYZ = ("x", "y", "z")
@@ -121,7 +123,7 @@ def read_message(data: bytes, msgtype: str) -> Message:
 
 def encode_joint_states(
     stamp_ns: IntArray, position: FloatArray, effort: FloatArray, names: tuple[str, ...], frame_id: str = ""
-) -> list[bytes]:
+) -> Iterator[bytes]:
     """Return one serialised message for each header stamp (ns), shape (N,); positions (m) and voltages (V), (N, K)."""
     if not names:
         raise RecordError("a stage_state message needs at least one axis name")
@@ -132,12 +134,17 @@ def encode_joint_states(
             "fit into a message stamp (0 to 2^31 s); shift the time axis"
         )
     template = _joint_state(names, frame_id)
-    data = np.tile(np.frombuffer(template, np.uint8), stamp_ns.size)
-    fields = data.view(read_message(template, JOINT_STATE).layout.dtype(len(template)))
-    fields["sec"], fields["nanosec"] = np.divmod(stamp_ns, SECOND_NS)
-    fields["position"], fields["effort"] = position, effort
-    stream = data.tobytes()
-    return [stream[start : start + len(template)] for start in range(0, len(stream), len(template))]
+    size, dtype = len(template), read_message(template, JOINT_STATE).layout.dtype(len(template))
+
+    def some(part: slice) -> Iterator[bytes]:
+        data = np.tile(np.frombuffer(template, np.uint8), stamp_ns[part].size)
+        fields = data.view(dtype)
+        fields["sec"], fields["nanosec"] = np.divmod(stamp_ns[part], SECOND_NS)
+        fields["position"], fields["effort"] = position[part], effort[part]
+        stream = data.tobytes()
+        return (stream[at : at + size] for at in range(0, len(stream), size))
+
+    return chain.from_iterable(some(slice(at, at + _AT_ONCE)) for at in range(0, stamp_ns.size, _AT_ONCE))
 
 
 def _joint_state(names: Sequence[str], frame_id: str) -> bytes:

@@ -107,17 +107,16 @@ def test_what_is_wrong_with_a_record_survives(tmp_path, storage):
     assert_same(read_bag(tmp_path / "bag"), record)
 
 
-@pytest.mark.parametrize(("order", "told"), [("back", "1 of 100"), ("reversed", "99 of 100"), ("ascending", "")])
+@pytest.mark.parametrize(("order", "told"), [("halves", "1 of 100"), ("reversed", "99 of 100"), ("ascending", "")])
 def test_that_messages_were_sorted_is_told(order, told, tmp_path):
     record = make_record(samples=100, axes=("x",))
     rows, stamps = np.arange(100), record.time_ns
-    if order == "back":
-        rows, stamps = np.roll(rows, 50), stamps - stamps[0] + 10**18
-        stamps[50:] += 20 * 10**9
+    if order == "halves":
+        rows = np.roll(rows, 50)
     elif order == "reversed":
         rows = rows[::-1]
     columns = (record.displacement["x"][:, None], record.voltage["x"][:, None])
-    messages = encode_joint_states(stamps, *columns, ("x",), "stage")
+    messages = list(encode_joint_states(stamps, *columns, ("x",), "stage"))
     with BagWriter(tmp_path / "bag") as bag:
         for row in rows.tolist():
             bag.write(int(stamps[row]), messages[row], "/stage_state")
@@ -125,7 +124,7 @@ def test_that_messages_were_sorted_is_told(order, told, tmp_path):
     np.testing.assert_array_equal(read.time_ns, stamps)
     notes = [note for note in read.notes if note.startswith(OUT_OF_ORDER)]
     assert [told in note for note in notes] == ([True] if told else [])
-    assert any("--stop" in note for note in notes) == (order == "back")
+    assert not any("--stop" in note for note in read.notes)
 
 
 @both_storages

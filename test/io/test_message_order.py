@@ -26,7 +26,7 @@ STAMPS = START + PERIOD * np.arange(N)
 
 
 def messages(stamps, y=Y, v=V):
-    return encode_joint_states(np.asarray(stamps, np.int64), y[:, None], v[:, None], ("x",))
+    return list(encode_joint_states(np.asarray(stamps, np.int64), y[:, None], v[:, None], ("x",)))
 
 
 def mcap(path, rows, channels=None, profile="ros2"):
@@ -231,7 +231,7 @@ def test_sqlite_files_too(tmp_path):
 
 
 def test_an_axis_that_is_named_twice(tmp_path):
-    both = encode_joint_states(STAMPS, np.column_stack([Y, Y + 1e-6]), np.column_stack([V, V]), ("x", "x"))
+    both = list(encode_joint_states(STAMPS, np.column_stack([Y, Y + 1e-6]), np.column_stack([V, V]), ("x", "x")))
     path = mcap(tmp_path / "bag.mcap", [("a", at, data) for at, data in zip(STAMPS, both, strict=True)])
     message = refusal(RecordError, read_bag, path)
     assert holds(message, path, "x, x") and "recover" not in message

@@ -33,7 +33,8 @@ path, storage, synced, lost, spilled = sys.argv[1], sys.argv[2], *map(int, sys.a
 bag = BagWriter(path, storage=storage)
 count = synced + lost
 t = np.arange(1, count + 1, dtype=np.int64) * 1_000_000
-messages = encode_joint_states(t, np.arange(count)[:, None] * 1e-9, np.arange(count)[:, None] * 0.01, ("x",), "stage-7")
+rows = np.arange(count)[:, None]
+messages = list(encode_joint_states(t, rows * 1e-9, rows * 0.01, ("x",), "stage-7"))
 if spilled:
     bag._writer.storage.conn.execute("PRAGMA cache_size = 1")
 for row, message in enumerate(messages):

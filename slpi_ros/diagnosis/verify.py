@@ -439,7 +439,8 @@ def _run(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: StartMe
         t=t,
         samples=samples,
         judged=judged,
-        samples_in_span=round(np.count_nonzero(t >= since) / samples.held),
+        # Held readings that jitter leave somewhat more fresh ones than their mean number of rows tells.
+        samples_in_span=max(round(np.count_nonzero(t >= since) / samples.held), int(np.count_nonzero(judged))),
         begins_known=begins_known,
         found=found,
         simulated=simulated + shift,

@@ -98,7 +98,7 @@ def test_a_model_is_as_good_as_that_of_the_fresh_readings(rows, digits, jitter):
     ((one,), (other,)) = (
         slpi_ros.verify([record(t, v, shown)], model).axes["x"].records for shown in (y, np.where(new, y, np.nan))
     )
-    assert one.error.rms == pytest.approx(other.error.rms, rel=0.05) and one.share == pytest.approx(1.0, abs=0.1)
+    assert one.error.rms == pytest.approx(other.error.rms, rel=0.05) and 0.9 <= one.share <= 1.0
 
 
 def test_it_is_told_and_judged_at_the_rate_of_the_sensor():

@@ -54,6 +54,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # No verdict depends on the clock. CI draws the same examples every time; `make test-long` draws more of them.
 CI = bool(os.environ.get("CI"))
 EXAMPLES = int(os.environ.get("SLPI_EXAMPLES", "25"))
+# The other environments differ in versions: of each test with nodes or devices they run the first quick case.
+FIRST_CASES = bool(os.environ.get("SLPI_FIRST_CASES"))
 hypothesis.settings.register_profile("slpi_ros", deadline=None, derandomize=CI, max_examples=EXAMPLES)
 hypothesis.settings.load_profile("slpi_ros")
 
@@ -71,9 +73,25 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.flaky(reruns=1, reruns_delay=2))
         if "measured_data" in getattr(item, "fixturenames", ()):
             item.add_marker("measured")
+    if FIRST_CASES:
+        _keep_first_cases(config, items)
     # Nodes and the files with slow tests begin first; what is short fills the gaps at the end.
     first = {item.path for item in items if item.get_closest_marker("slow") or item.path.parent.name in TOGETHER}
     items.sort(key=lambda item: (item.path.parent.name != STREAM, item.path not in first))
+
+
+def _keep_first_cases(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Deselect all but the first quick case of each test with nodes or devices."""
+    found, kept, others = set(), [], []
+    for item in items:
+        starts = item.get_closest_marker("ros") or item.path.parent.name == "drivers"
+        quick = not (item.get_closest_marker("slow") or item.get_closest_marker("long"))
+        test = item.nodeid.partition("[")[0]
+        (others if starts and quick and test in found else kept).append(item)
+        if quick:
+            found.add(test)
+    config.hook.pytest_deselected(items=others)
+    items[:] = kept
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -26,8 +26,8 @@ IN_OWN_DOMAIN := $(IN_WORKSPACE) $(VENV) benchmarks/ros_domain.py
 VENV_STAMP  := .venv$(SUFFIX)/.stamp
 BUILD_STAMP := $(INSTALL)/.stamp
 
-# One worker waits for nodes most of the time, the others compute (test/conftest.py).
-PYTEST := $(IN_WORKSPACE) $(COMPILED) $(VENV) -m pytest -n 3
+# Two workers wait for nodes most of the time, the others compute (test/conftest.py).
+PYTEST := $(IN_WORKSPACE) $(COMPILED) $(VENV) -m pytest -n 4
 
 # What .venv has to be made for: a copied checkout, another Python or a newly sourced ROS needs another one.
 WANTED := $(CURDIR) ROS_DISTRO=$(ROS_DISTRO) $(if $(PYTHON),PYTHON=$(PYTHON))
@@ -48,7 +48,7 @@ help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
 	@echo 'make test       build, lint, types, docstrings, tests: ten minutes on two cores'
 	@echo 'make test-long  build, then the tests that take long, and properties with more examples'
-	@echo 'make test-jazzy    the versions of Ubuntu 24.04 with Python 3.12: the quick tests of make test'
+	@echo 'make test-jazzy    the versions of Ubuntu 24.04 with Python 3.12: the quick tests of make test that depend on them'
 	@echo 'make test-newest   the same tests with the newest versions of today, Python 3.13 if it is there; make test-minimum with'
 	@echo '                   the oldest allowed; make test-kilted with the newest and ROS 2 Kilted'
 	@echo 'make docs       build, then the documentation site: docs/_build/html/index.html'
@@ -123,14 +123,16 @@ test-long: export SLPI_EXAMPLES = 50
 test-long: build
 	$(PYTEST) -m 'long or hypothesis'
 
-# The tests of `make test` that take no more than ten seconds.
+# The tests of `make test` that take no more than ten seconds and whose outcome may depend on versions: not those of the
+# checkout itself, and of tests with nodes and devices one case each.
 test-jazzy test-newest test-kilted test-minimum:
 	@$(MAKE) --no-print-directory ENVIRONMENT=$(@:test-%=%) test-environment
 
 test-environment: export SLPI_EXAMPLES = 10
+test-environment: export SLPI_FIRST_CASES = 1
 test-environment: build
 	$(VENV) tools/list_versions.py
-	$(PYTEST) -m 'not long and not slow'
+	$(PYTEST) -m 'not long and not slow' $(addprefix --ignore=test/,benchmarks documentation test_architecture.py)
 
 schemas: build
 	$(VENV) tools/make_schemas.py

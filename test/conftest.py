@@ -17,6 +17,8 @@ from benchmarks.ros_domain import OWN, keep_to_own_domain
 CHECKOUT = Path(__file__).resolve().parents[1]
 # The folder whose tests start nodes.
 STREAM = "nodes"
+# Workers that begin with them, each in a ROS domain of its own.
+STREAMS = 2
 # Folders whose files are run one after the other, too: they share what takes long to make, or start some nodes.
 TOGETHER = ("fleet", "documentation")
 # Those that compute more than they wait, and need no core at any moment.
@@ -52,6 +54,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 # No verdict depends on the clock. CI draws the same examples every time; `make test-long` draws more of them.
 CI = bool(os.environ.get("CI"))
 EXAMPLES = int(os.environ.get("SLPI_EXAMPLES", "25"))
+# The other environments differ in versions: of each test with nodes or devices they run the first quick case.
+FIRST_CASES = bool(os.environ.get("SLPI_FIRST_CASES"))
 hypothesis.settings.register_profile("slpi_ros", deadline=None, derandomize=CI, max_examples=EXAMPLES)
 hypothesis.settings.load_profile("slpi_ros")
 
@@ -69,24 +73,49 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
             item.add_marker(pytest.mark.flaky(reruns=1, reruns_delay=2))
         if "measured_data" in getattr(item, "fixturenames", ()):
             item.add_marker("measured")
-    # The stream of nodes and the files with slow tests begin first; what is short fills the gaps at the end.
+    if FIRST_CASES:
+        _keep_first_cases(config, items)
+    # Nodes and the files with slow tests begin first; what is short fills the gaps at the end.
     first = {item.path for item in items if item.get_closest_marker("slow") or item.path.parent.name in TOGETHER}
     items.sort(key=lambda item: (item.path.parent.name != STREAM, item.path not in first))
 
 
+def _keep_first_cases(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Deselect all but the first quick case of each test with nodes or devices."""
+    found, kept, others = set(), [], []
+    for item in items:
+        starts = item.get_closest_marker("ros") or item.path.parent.name == "drivers"
+        quick = not (item.get_closest_marker("slow") or item.get_closest_marker("long"))
+        test = item.nodeid.partition("[")[0]
+        (others if starts and quick and test in found else kept).append(item)
+        if quick:
+            found.add(test)
+    config.hook.pytest_deselected(items=others)
+    items[:] = kept
+
+
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
-    """Give all tests with nodes, one after the other, to one worker, and whole files to the others.
+    """Give whole files to workers, as a file's tests share fixtures: those with nodes to two, the others to the rest.
 
-    Nodes wait most of their time, and two tests with nodes at once disturb each other; a file's tests share fixtures.
+    Nodes wait most of their time, but many of them at once would disturb each other. Who has done his own helps.
     """
     from xdist.scheduler import LoadScopeScheduling
 
     class ByFile(LoadScopeScheduling):
         def _split_scope(self, nodeid: str) -> str:
             file = Path(nodeid.partition("::")[0])
-            together = file.parent.name in (STREAM, *TOGETHER) and file.name not in COMPUTES
-            return file.parent.name if together else str(file)
+            together = file.parent.name in TOGETHER and file.name not in COMPUTES
+            return str(file.parent if together else file)
+
+        def _assign_work_unit(self, node: Any) -> None:
+            has_nodes = node in list(self.assigned_work)[:STREAMS]
+            for scope in self.workqueue:
+                path = Path(scope)
+                if (path.parent.name == STREAM and path.name not in COMPUTES) == has_nodes:
+                    self.workqueue.move_to_end(scope, last=False)
+                    break
+            super()._assign_work_unit(node)
 
         def mark_test_pending(self, item: str) -> None:
             """Give the test in which a worker died its second try: `remove_node` has queued it again already."""

@@ -1,5 +1,7 @@
 """Size of the part of a signal that no rate-independent hysteresis can explain."""
 
+from functools import lru_cache
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -36,13 +38,8 @@ def beyond_hysteresis(v: FloatArray, signal: FloatArray) -> float:
     -------
     float, metres
     """
-    rng = np.random.default_rng(0)
-    rows = np.sort(rng.choice(v.size, min(SAMPLES, v.size), replace=False))
-    columns = _columns(v, rows)
+    rows, columns, gram = _regression(v.tobytes())
     target = signal[rows] - signal[rows].mean()
-    columns -= columns.mean(axis=0)
-    gram = columns.T @ columns
-    gram[np.diag_indices_from(gram)] += RIDGE * np.trace(gram) / gram.shape[0]
     left = target - columns @ np.linalg.solve(gram, columns.T @ target)
     return float(np.sqrt(np.mean(left**2)))
 
@@ -54,6 +51,19 @@ def beyond_identified(time_ns: NDArray[np.int64], v: FloatArray, reading: FloatA
     whose size depends on the grid that the identification chooses.
     """
     return float(identify(Record(time_ns, {"x": v}, {"x": reading})).axes["x"].quality.rms)
+
+
+# Each strength of an effect is tried on one voltage.
+@lru_cache(maxsize=1)
+def _regression(voltage: bytes) -> tuple[NDArray[np.int64], FloatArray, FloatArray]:
+    """Return samples, centred columns and regularized normal matrix of a voltage (float64, V)."""
+    v = np.frombuffer(voltage)
+    rows = np.sort(np.random.default_rng(0).choice(v.size, min(SAMPLES, v.size), replace=False))
+    columns = _columns(v, rows)
+    columns -= columns.mean(axis=0)
+    gram = columns.T @ columns
+    gram[np.diag_indices_from(gram)] += RIDGE * np.trace(gram) / gram.shape[0]
+    return rows, columns, gram
 
 
 def _columns(v: FloatArray, rows: NDArray[np.int64]) -> FloatArray:

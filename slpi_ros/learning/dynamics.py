@@ -8,6 +8,7 @@ pass before is a part of the estimate and not a disturbance that must be waited 
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -442,6 +443,7 @@ class Dynamics:
         response = poles.response(self._w)[:, :2]
         answers = poles.answers([one.commanded for one in passes], 0) if self._follow else []
 
+        @cache
         def rung(number: int | None) -> ComplexArray:
             return np.zeros_like(response) if number is None else poles.ringing(self._size, number)[:, :2]
 

@@ -119,6 +119,7 @@ class RelayTriangle:
         self._weight: FloatArray = np.tril(density((up + down) / 2, np.maximum(up - down, 0.0)))
         self._state: FloatArray = np.zeros((levels, levels))
         self._index = np.arange(levels, dtype=np.float64)
+        self._used = np.tri(levels)
         self.all_down()
 
     def all_down(self) -> None:
@@ -136,7 +137,7 @@ class RelayTriangle:
     @property
     def state(self) -> FloatArray:
         """Share of relays that are up in each group, shape (levels, levels), 0 for unused elements; a copy."""
-        return np.tril(self._state)
+        return self._state * self._used
 
     def check(self, voltage: float) -> None:
         """Raise UsageError if a voltage (V) is not a number within the threshold range."""
@@ -158,18 +159,19 @@ class RelayTriangle:
         # Rows below the old voltage are already up; rows above the new voltage are not reached.
         first, end = int(self._position), min(int(position) + 1, len(self._index))
         share = np.minimum(position - self._index[first:end, None], 1.0)
-        block = (slice(first, end), slice(0, end))
-        self._switch(block, np.maximum(self._state[block], share))
+        state = self._state[first:end, :end]
+        self._switch(self._weight[first:end, :end], state, np.maximum(state, share))
 
     def _fall(self, position: float) -> None:
         first, end = int(position), min(int(self._position) + 1, len(self._index))
         share = np.maximum(position - self._index[None, first:end], 0.0)
-        block = (slice(first, None), slice(first, end))
-        self._switch(block, np.minimum(self._state[block], share))
+        state = self._state[first:, first:end]
+        self._switch(self._weight[first:, first:end], state, np.minimum(state, share))
 
-    def _switch(self, block: tuple[slice, slice], after: FloatArray) -> None:
-        self.output += float(np.sum(self._weight[block] * (after - self._state[block])))
-        self._state[block] = after
+    def _switch(self, weight: FloatArray, state: FloatArray, after: FloatArray) -> None:
+        # np.sum would check its arguments first, which takes as long as the sum.
+        self.output += float(np.add.reduce(weight * (after - state), axis=None))
+        state[:] = after
 
 
 @dataclass(frozen=True)

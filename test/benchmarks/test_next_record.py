@@ -150,6 +150,7 @@ def test_an_ambiguous_record_and_the_advised_one(next_record, monkeypatch):
 
 
 @pytest.mark.slow
+@pytest.mark.long
 def test_a_pair_is_judged_on_a_third_record(next_record, monkeypatch):
     answers = Answers()
     monkeypatch.setattr(slpi_ros, "diagnose", answers)

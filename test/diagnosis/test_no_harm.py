@@ -13,45 +13,31 @@ from slpi_ros.io.tables import import_table
 pytestmark = pytest.mark.slow
 
 
-@pytest.fixture(scope="module")
-def hidden():
+def test_causes_that_make_the_fitted_record_worse_are_dropped(monkeypatch):
     record = hide(2, ["creep"], size=10.0, axes=1, samples=6_000).record
-    return record, slpi_ros.identify(record)
-
-
-@pytest.fixture(scope="module")
-def sound(hidden):
-    (found,) = slpi_ros.diagnose(*hidden).axes.values()
-    return found
-
-
-def test_causes_that_make_the_fitted_record_worse_are_dropped(hidden, sound, monkeypatch):
-    record, model = hidden
-    extended = module._extended
+    model = slpi_ros.identify(record)
+    extended, spoilt = module._extended, []
 
     def spoiled(*arguments):
         """Stand for a joint fit that does not hold in a free run: 20 % too much gain wherever there is an effect."""
         found = extended(*arguments)
         high = found.displacement_range[1]
         effects = tuple(drifting(high) if effect.name == "creep" else effect for effect in found.effects)
+        spoilt.append(effects != found.effects)
         return replace(found, effects=effects)
 
     def drifting(origin):
         return GainDrift((0.0,), (0.2,), origin)
 
-    assert "creep" in [one.name for one in sound.effects]
     monkeypatch.setattr(module, "_extended", spoiled)
     diagnosis = slpi_ros.diagnose(record, model)
+    assert any(spoilt)
     (found,) = diagnosis.axes.values()
     (axis,) = diagnosis.extended.axes
     assert (found.effects, found.verdict) == ((), "unexplained")
     assert diagnosis.extended.axes[axis] == model.axes[axis]
     (outcome,) = found.records
     assert outcome.after_rms == outcome.before_rms
-
-
-def test_no_record_is_worse_with_the_extended_model(sound):
-    assert all(one.after_rms <= 1.05 * one.before_rms for one in sound.records)
 
 
 @pytest.mark.long

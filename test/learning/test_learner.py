@@ -1,6 +1,7 @@
 """A path that repeats gets better from pass to pass, and never worse, whatever the sensor says."""
 
 import json
+from copy import deepcopy
 from dataclasses import replace
 
 import numpy as np
@@ -66,11 +67,17 @@ class Stage:
         return y, y + self._rng.normal(0.0, self._noise, y.size)
 
 
-def learned(model, passes, stage=None, **options):
-    """Return the learner, the stage and the true errors (m) after some passes."""
+USUAL = {}
+
+
+def learned(model, passes, stage=None):
+    """Return the learner, the stage and the true errors (m) after some passes; with the usual stage a copy of them."""
+    if stage is None:
+        if (id(model), passes) not in USUAL:
+            USUAL[id(model), passes] = model, learned(model, passes, Stage(path()[1][0]))
+        return deepcopy(USUAL[id(model), passes][1], {id(model): model})
     t, desired = path()
-    learner = slpi_ros.Learner(model, t, desired, **options)
-    stage = stage or Stage(desired[0])
+    learner = slpi_ros.Learner(model, t, desired)
     errors = []
     for _ in range(passes):
         true, read = stage.run(learner.path())

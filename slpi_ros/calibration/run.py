@@ -21,7 +21,7 @@ from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.errors import RecordError, SlpiError, length
 from slpi_ros.excitation.drives import CALIBRATION as CALIBRATION_DRIVE
 from slpi_ros.excitation.drives import SWEEP, Drive
-from slpi_ros.identification.held_readings import without_held
+from slpi_ros.identification.held_readings import slower_sensor, without_held
 from slpi_ros.identification.progress import listening
 from slpi_ros.identification.signal_statistics import noise
 from slpi_ros.io.record import Record
@@ -258,7 +258,10 @@ class _Calibration:
         record = self._recorded(kind, drive, {}).record
         self._records.append(record)
         self._drives.append((kind, axes))
-        self._steps.append(Step(record.source, float(drive.t[-1]), why, drive.why))
+        period = float(np.median(np.diff(record.t)))
+        held = {axis: without_held(record, axis)[1] for axis in axes}
+        slow = [f"axis {axis}: {slower_sensor(rows, period)}" for axis, rows in held.items() if rows > 1.0]
+        self._steps.append(Step(record.source, float(drive.t[-1]), why, "; ".join([drive.why, *slow])))
 
     def _identify(self) -> StageModel:
         self._begin("identifying the hysteresis")

@@ -115,9 +115,11 @@ def outward_steps(v: FloatArray, used: Mask) -> tuple[IntArray, IntArray]:
     """Return the first and last samples, (M,), of steps of a voltage (V, (N,)) away from the middle of its range."""
     # Beyond a clipping limit they give no displacement.
     low, high = float(v.min()), float(v.max())
+    at = np.flatnonzero(used)
+    v = v[at]
     # Steps over several samples improve the signal-to-noise ratio.
     every = max(1, round((high - low) / BINS / 4 / max(float(np.mean(np.abs(np.diff(v)))), 1e-12)))
     middle, dv = 0.5 * (v[every:] + v[:-every]), v[every:] - v[:-every]
     outward = (dv > 0) == (middle > 0.5 * (low + high))
-    first = np.flatnonzero(used[every:] & used[:-every] & outward & (dv != 0.0))
-    return first, first + every
+    first = np.flatnonzero(outward & (dv != 0.0))
+    return at[first], at[first + every]

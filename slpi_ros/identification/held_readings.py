@@ -131,6 +131,12 @@ def without_held(record: Record, axis: str) -> tuple[Record, float]:
     return replace(record, displacement={**record.displacement, axis: fresh}), found.rows
 
 
+def slower_sensor(rows: float, period: float) -> str:
+    """Return what is told of a sensor whose readings are held for a number of rows, at a `period` (s) of the rows."""
+    fresh = f"each reading is repeated for {rows:.3g} samples, {1.0 / (rows * period):.4g} are fresh per second"
+    return f"the sensor is slower than the record: {fresh}; only these are used"
+
+
 def _speeds(y: FloatArray, rows: int) -> FloatArray:
     """Return the mean change of readings, (N,), from row to row over some rows on either side, (N - 1,)."""
     reach = int(np.clip(rows, _LEAST, _MOST))

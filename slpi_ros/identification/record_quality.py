@@ -11,7 +11,7 @@ from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import IdentificationError, length
 from slpi_ros.identification import bad_readings, drive, signal_statistics
 from slpi_ros.identification.drive import SPEED_FACTOR
-from slpi_ros.identification.held_readings import held_readings
+from slpi_ros.identification.held_readings import held_readings, slower_sensor
 from slpi_ros.identification.samples import NEAR_END, NEVER_TURNS, WINDOW, bounds, select_thinned, windows
 from slpi_ros.io.record import Record, release
 
@@ -380,9 +380,7 @@ def _held(quality: Quality) -> Iterator[Finding]:
     """Say that the sensor is slower than the record."""
     rows = quality.displacement.held
     if rows > 1.0 and quality.clock.period:
-        rate = 1.0 / (rows * quality.clock.period)
-        text = f"the sensor is slower than the record: each reading is repeated for {rows:.3g} samples"
-        yield Finding("warn", f"{text}, {rate:.4g} are fresh per second; only these are used")
+        yield Finding("warn", slower_sensor(rows, quality.clock.period))
 
 
 def _displacement(y: SignalQuality) -> Iterator[Finding]:

@@ -5,7 +5,8 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from calibration.stages import SimulatedRecorder, settings, stage_of
+from calibration.stages import RATE, SimulatedRecorder, settings, stage_of
+from refusals import holds
 from strategies import FAMILY_CASE, axis_model
 
 from slpi_ros.calibration.run import Recording, aligned, calibrate, tracking_error, why, with_present_zero
@@ -200,3 +201,19 @@ def test_a_hidden_cause_is_named_and_undone(tmp_path):
     assert {path.name for path in tmp_path.iterdir()} == {"model.json", "report.html", "diagnosis"}
     page = (tmp_path / "report.html").read_text()
     assert all(step.name in page for step in outcome.steps)
+
+
+@pytest.mark.slow
+def test_a_sensor_that_is_slower_than_the_record_is_told():
+    class Held(SimulatedRecorder):
+        def __call__(self, request):
+            recording = super().__call__(request)
+            (y,) = recording.record.displacement.values()
+            held = y[np.arange(y.size) // 2 * 2]
+            return replace(recording, record=replace(recording.record, displacement={"x": held}))
+
+    recorder = Held(stage_of(Character()))
+    outcome = calibrate(settings(), recorder)
+    assert outcome.met
+    told = [step.finding for step in outcome.steps if step.name.endswith("_calibration")]
+    assert told and all(holds(finding, 2, round(RATE / 2)) for finding in told)

@@ -23,7 +23,7 @@ MODELS = {"PI": "tab:orange", "SLPI, causes": "black"}
 
 
 def draw(folder: Path, path: Path) -> None:
-    """Draw the last cycle over the voltage, and the errors of the models over its time, % of the range."""
+    """Draw the last cycle over the voltage, and the errors of the models in it without their mean, % of the range."""
     import matplotlib
 
     matplotlib.use("svg")
@@ -43,7 +43,7 @@ def draw(folder: Path, path: Path) -> None:
     for method in METHODS:
         if method.name in MODELS:
             run, _, _ = free_run(method.fit(records), one, records)
-            run = run - np.mean(run - one.y)
+            run = run - np.mean((run - one.y)[shown])
             name = "SLPI" if method.name.startswith("SLPI") else method.name
             colour = MODELS[method.name]
             loop.plot(one.v[shown], share * (run[shown] - zero), color=colour, linewidth=1.0, label=name)

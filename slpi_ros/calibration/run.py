@@ -174,7 +174,7 @@ class _Calibration:
         first = self._identify()
         self._verify(first)
         self._survey()
-        ended = "no further record promises to tell more"
+        ended = "no further record is expected to add information"
         for _ in range(MOST_ROUNDS):
             diagnosis = self._diagnose(first)
             while choice := next_drive(settings, diagnosis.axes, self._drives, self._left):

@@ -363,9 +363,9 @@ def _summary(
     verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], noise_rms: float, before_rms: float
 ) -> str:
     after = selection.now.held_out.rms_of_records
-    left = f"{length(after)} rms are left, the sensor noise is {length(noise_rms)}"
+    left = f"the remaining error is {length(after)} rms, the sensor noise {length(noise_rms)}"
     found = ", then ".join(
-        f"{named.name}, which reduces {'the rest' if place else 'the error'} by {named.gain_percent:.0f} %"
+        f"{named.name}, which reduces {'the remaining error' if place else 'the error'} by {named.gain_percent:.0f} %"
         for place, named in enumerate(effects)
     )
     if verdict == NOTHING_FOUND:
@@ -379,13 +379,13 @@ def _summary(
     if verdict == AMBIGUOUS:
         open_ones = (named for named in effects if named.alternatives)
         others = "".join(f" The record cannot tell {one.name} from {', '.join(one.alternatives)}." for one in open_ones)
-    return f"{structure}Found: {found}.{others} The held-out error falls from {length(before_rms)}; {left}."
+    return f"{structure}Found: {found}.{others} The held-out error was {length(before_rms)} before; {left}."
 
 
 def _cannot_tell(driven_alike: Sequence[str]) -> str:
     if not driven_alike:
         return ""
-    return f" Axis {', '.join(driven_alike)} has the same drive: whether it couples into this one cannot be told."
+    return f" Axis {', '.join(driven_alike)} has the same drive: its coupling into this one cannot be identified."
 
 
 def _looked_at(evidence: Evidence, effects: Sequence[NamedEffect]) -> str:
@@ -393,7 +393,7 @@ def _looked_at(evidence: Evidence, effects: Sequence[NamedEffect]) -> str:
     followed = {key for named in effects for key in named.effect.keys}
     others = [key for key in evidence.surroundings if key not in followed]
     return (
-        f" Recorded quantities that were tried and are no cause as far as these records tell: {', '.join(others)}."
+        f" Recorded quantities that were tried and have no effect in these records: {', '.join(others)}."
         if others
         else ""
     )
@@ -415,7 +415,7 @@ def _next(
         first = next((named for named in effects if named.alternatives), effects[0])
         steps.append(_separating((first.name, *first.alternatives), selection.now.evidence))
     if verdict == PARTLY_NAMED and left:
-        steps.append(f"For what is left, {hint(left[0].variable)}.")
+        steps.append(f"For the remaining error, {hint(left[0].variable)}.")
     elif verdict in (UNEXPLAINED, PARTLY_NAMED) and not steps:
         steps.append(_more_loops(selection.now.evidence))
     return " ".join(steps) or None

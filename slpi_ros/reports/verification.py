@@ -188,7 +188,7 @@ def _lacking(record: RecordVerification) -> str:
 def _why_unproved(record: RecordVerification) -> str:
     """Return why nothing is proved (useless readings, the initial state, a record of the fit), and what to do."""
     if record.unusable >= 1.0 - LEAST:
-        return "Too few readings are left: check the sensor and its link, 'slpi doctor' tells what is wrong with them."
+        return "Too few readings are left: check the sensor and its link, 'slpi doctor' says what is wrong with them."
     if record.share >= LEAST and record.judged_error <= record.limit and not record.independent:
         return "The model was identified from this record, so that a small error proves nothing: record another one."
     if record.share >= LEAST and record.judged_error <= record.limit and record.lacking:

@@ -45,7 +45,7 @@ MEANT = {
     "simulator": "stages of the package's own simulator with creep and a lag: the same",
     "clean": "simulated stages without a hidden effect: an effect named",
     "unknown": f"simulated stages with one of {len(KINDS)} causes that no effect describes: a wrong name, or no "
-    "report of what is left",
+    "report of the remaining error",
 }
 # Group "simulator": the simulated stage of the package and its default calibration drive (s, Hz), sensor noise (m), lag
 # (s), and smallest and largest creep per decade of time (share of the displacement).

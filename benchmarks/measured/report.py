@@ -75,7 +75,8 @@ def readme_table(rows: Rows, manifest: Manifest, date: str, command: str) -> str
         f"range; {date}, `{command}`. **Bold**: the best of {count} methods; *equal*: not significantly worse than the "
         f"best (95 %). A device whose motion was measured has one row: the one with the median ratio of *SLPI, causes* "
         f"to the best other method, of two the worse one. [All {len(rows)} rows, all methods]"
-        f"(docs/explanation/measured.md): SLPI, with or without causes, is the best in {wins}, and the best or equal in {near}. {_cost(rows)}"
+        f"(docs/explanation/measured.md): SLPI, with or without causes, is the best in {wins}, and the best or equal "
+        f"in {near}. {_cost(rows)}"
     )
     return "\n".join([*lines, "", said])
 

@@ -340,7 +340,7 @@ def _of_given(given: Given, selection: Selection, before_rms: float) -> str:
 
 def _in_model(now: Explanation, effects: Sequence[NamedEffect], dropped: Sequence[str]) -> str:
     own = [effect.name for effect in now.effects if isinstance(effect, EachRecord)]
-    said = f" Different in each record, so not in the extended model: {', '.join(own)}." if own else ""
+    said = f" Each record has its own, so not in the extended model: {', '.join(own)}." if own else ""
     if undecided := [named.name for named in effects if named.alternatives and named.name not in own]:
         said += (
             f" In the extended model as one of several possible causes: {', '.join(undecided)}; proved at the drive "

@@ -207,8 +207,8 @@ def characters(count: int, first: int, keep: bool) -> None:
         )
     if rows and keep:
         what = (
-            f"the calibrator on {len(stages)} simulated stages with one or two hidden effects: stages with the right "
-            "causes; error on a new path, median of the axes; the same after a fixed drive, without causes"
+            f"calibrator, {len(stages)} simulated stages with one or two hidden effects: stages with all causes found; "
+            "median error on a new path; the same without causes, after a fixed drive"
         )
         error = np.median([row.error.rest / row.error.stroke for row in rows])
         fixed = np.median([row.fixed.rest / row.fixed.stroke for row in rows])

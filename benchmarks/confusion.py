@@ -38,14 +38,14 @@ from slpi_ros.simulation.parameters import AxisParameters
 FloatArray = NDArray[np.float64]
 GROUPS = ("single", "pair", "simulator", "clean", "unknown")
 SAMPLES = 40_000
-# What the groups are, in README.
+# What the groups are, in the tables of figures.
 MEANT = {
     "single": "simulated stages with one hidden effect: that one named or among the alternatives, and no other",
     "pair": "simulated stages with two hidden effects: both named or among the alternatives, and no other",
     "simulator": "stages of the package's own simulator with creep and a lag: the same",
-    "clean": "simulated stages without a hidden effect: any name",
-    "unknown": f"simulated stages with one of {len(KINDS)} causes that no effect describes: a wrong name, or silence "
-    "on what is left",
+    "clean": "simulated stages without a hidden effect: an effect named",
+    "unknown": f"simulated stages with one of {len(KINDS)} causes that no effect describes: a wrong name, or no "
+    "report of the remaining error",
 }
 # Group "simulator": the simulated stage of the package and its default calibration drive (s, Hz), sensor noise (m), lag
 # (s), and smallest and largest creep per decade of time (share of the displacement).
@@ -275,7 +275,7 @@ def main() -> None:
         for group in options.groups:
             own = [one for one in outcomes if one.case.group == group]
             bad = sum(one.wrong or one.silent or bool(one.failure) for one in own)
-            said = f"{sum(one.right for one in own)} of {len(own)}; {bad} wrong or silent"
+            said = f"{sum(one.right for one in own)} of {len(own)}; {bad} wrong or nothing reported"
             said = f"{bad} of {len(own)}" if group in ("clean", "unknown") else said
             kept.write_row(f"confusion {group}", f"diagnosis, {MEANT[group]}", said, "make bench-confusion")
     table(sorted(outcomes, key=lambda one: (GROUPS.index(one.case.group), one.case.hidden, one.case.seed)))

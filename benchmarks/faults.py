@@ -302,9 +302,8 @@ def main() -> int:
     if options.keep:
         total = sum((counts for name, counts in rows if not name.startswith(" ")), Counter[str]())
         what = (
-            "damaged input and bad luck (mutated bags, models and messages; lives of a compensator with full disks, "
-            "clock jumps and `kill -9`; a simulated day): cases; refused; wrong, such as a traceback, a hang or a "
-            "voltage outside of a limit"
+            "damaged bags, models and messages, full disks, clock jumps and `kill -9`: cases; refused; wrong, such as "
+            "a traceback, a hang or a voltage outside of a limit"
         )
         said = f"{total['tried']:,}; {total['refused']:,}; {total['wrong']}"
         kept.write_row("faults", what, said, "make bench-faults")

@@ -332,15 +332,14 @@ def compare(
 
 
 def keep(specimen: Specimen, seed: int, passes: int, errors: Mapping[str, Any]) -> None:
-    """Write the row of README on paths that repeat."""
+    """Keep the row of a raster that repeats."""
     what = (
-        f"a path that repeats, on a simulated stage of another physics ({specimen.kind}, a mode of "
-        f"{specimen.frequency:.0f} Hz with a damping of {specimen.damping:.3f}, {1e9 * specimen.noise:.1f} nm of "
-        "sensor noise): true error on a raster of 20 Hz with the inverse alone; with PI feedback; after "
-        f"{passes} passes of learning without a model of the dynamics, through a straight line and through the "
-        "inverse; of `learn` (where a mode was not identified, tens of nanometres may stay)"
+        f"a raster of 20 Hz that repeats, simulated stage with a mode of {specimen.frequency:.0f} Hz and "
+        f"{1e9 * specimen.noise:.1f} nm of sensor noise, rms error: inverse alone; PI feedback; `learn` after {passes} "
+        "passes; learning without a model of the dynamics: from a straight line, from the inverse"
     )
-    figures = [errors["learner"][0], *(errors[each][-1] for each in ("PI", "line", "inverse", "learner"))]
+    last = {each: errors[each][-1] for each in ("PI", "learner", "line", "inverse")}
+    figures = [errors["learner"][0], *last.values()]
     said = "; ".join(f"{one:.1f} nm" for one in figures)
     kept.write_row("learning", what, said, f'make bench-learning LEARNING="--seed {seed} --count 1"')
 

@@ -291,7 +291,8 @@ def main() -> None:
     if options.keep:
         largest = float(np.abs(found).max())
         what = (
-            f"the commands of this page on {len(options.seeds)} simulated stages, that day and the next: largest error"
+            f"the commands of README on {len(options.seeds)} simulated stages, on the same and on the next day: "
+            "largest error"
         )
         kept.write_row("readme", what, f"{largest:.3f} % of stroke", "make bench-readme")
 

@@ -253,9 +253,9 @@ def main() -> int:
     if options.keep:
         ratio = max(worst.step, worst.slew, worst.acceleration, worst.start)
         what = (
-            f"what the amplifier feels, {worst.outputs:,} voltages of {options.episodes:,} random episodes and "
-            f"{options.lives} lives of real processes: largest ratio to a limit of step, slew, acceleration and first "
-            "step; volts outside of the limits"
+            f"limits, {worst.outputs:,} voltages of {options.episodes:,} random episodes and {options.lives} runs of "
+            "real processes: largest ratio to the limit of step, slew, acceleration and first step; largest voltage "
+            "outside of the limits, V"
         )
         kept.write_row("steps", what, f"{ratio:.3f}; {max(worst.outside, 0.0):.3g}", "make bench-steps")
     wrong = max(worst.step, worst.slew, worst.acceleration, worst.start) > 1.0 + 1e-6 or worst.outside > 0.0

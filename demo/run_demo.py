@@ -98,7 +98,7 @@ def compared(seed: int, models: Mapping[str, Path], stroke: tuple[float, float],
 
 
 def table_of(runs: Sequence[plots.Run], stroke: float) -> list[list[str]]:
-    """Return the mean error of each run, its constant part, and the mean and maximum of the rest."""
+    """Return the mean error of each run, its offset, and mean and maximum without it."""
     rows = []
     for run in runs:
         constant = float(np.median(run.error))
@@ -109,7 +109,7 @@ def table_of(runs: Sequence[plots.Run], stroke: float) -> list[list[str]]:
     return rows
 
 
-HEADER = ["path not in the records", "mean error", "of stroke", "of it constant", "the rest, mean", "maximum"]
+HEADER = ["path not in the records", "mean error", "of stroke", "offset", "without offset, mean", "maximum"]
 
 
 def write_page(
@@ -121,7 +121,7 @@ def write_page(
         f"A simulated stage with hysteresis and hidden effects (seed {seed}) calibrated itself: it recorded what was "
         "needed, identified a model and searched for causes of what was left. On the next day it followed a path that "
         "no record holds. Simulator, calibrator and compensator ran as separate ROS 2 processes. Errors in the table "
-        "are absolute, then their constant part and the rest, and include 8 nm rms of sensor noise."
+        "include the offset; then follow the offset and the error without it. 8 nm rms of sensor noise are included."
     )
     page.table(HEADER, rows, best=len(rows) - 1)
     page.text(told)

@@ -70,6 +70,14 @@ def test_versions_agree():
     assert f"\n{version} (" in (ROOT / "CHANGELOG.rst").read_text()
 
 
+def test_the_changelog_is_short_and_names_no_other_version():
+    version = ElementTree.parse(ROOT / "package.xml").getroot().find("version").text
+    sections = re.split(r"^(.+)\n-+$", (ROOT / "CHANGELOG.rst").read_text(), flags=re.MULTILINE)[1:]
+    for name, text in zip(sections[::2], sections[1::2], strict=True):
+        assert name == "Forthcoming" or name.split()[0] == version
+        assert 1 <= len(re.findall(r"^\* ", text, re.MULTILINE)) <= 30, name
+
+
 def minima():
     """Return the lower bound of each package that setup.py names one for."""
     found = re.findall(r'"([\w-]+)(?:\[\w+\])?>=([\w.]+)', (ROOT / "setup.py").read_text())

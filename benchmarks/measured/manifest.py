@@ -35,12 +35,15 @@ class Source:
         Licence of the repository; ``none stated`` where it names none.
     device : str
         What was measured.
+    moves : bool
+        Whether a motion was measured; False for a polarisation.
     """
 
     repository: str
     commit: str
     licence: str
     device: str
+    moves: bool = True
 
     def __post_init__(self) -> None:
         _require(bool(_REPOSITORY.fullmatch(self.repository)), f"repository '{self.repository}' is not owner/name")
@@ -93,11 +96,12 @@ class MeasuredRecord:
 
 @dataclass(frozen=True)
 class Span:
-    """A part of a record, from `start` to before `stop`, s; by default all of it."""
+    """A part of a record, from `start` to before `stop`, s; by default all of it. `name`: for the tables."""
 
     record: str
     start: float = 0.0
     stop: float = math.inf
+    name: str = ""
 
     def __post_init__(self) -> None:
         _require(0.0 <= self.start < self.stop, f"{self.record}: from {self.start} to {self.stop} s is no time span")

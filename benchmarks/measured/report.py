@@ -1,14 +1,14 @@
-"""The tables of README and of the page on measured records, and the picture, from the file of kept figures.
+"""The tables of README and of the pages of figures, and the picture, from the file of kept figures.
 
     python -m benchmarks.measured.report [--check]
 
-Writes what stands between marks in README.md and docs/explanation/measured.md, and ``docs/images/measured.svg``. With
-``--check`` the pages are compared only; the exit code is 1 if one differs.
+Writes what stands between marks in README.md and in measured.md and figures.md of docs/explanation, and
+``docs/images/measured.svg``. With ``--check`` the pages are compared only; the exit code is 1 if one differs.
 """
 
 import argparse
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,46 +20,65 @@ from benchmarks.measured.manifest import Manifest, read_manifest
 
 ROOT = Path(__file__).resolve().parents[2]
 README, PICTURE = ROOT / "README.md", ROOT / "docs" / "images" / "measured.svg"
-PAGE = ROOT / "docs" / "explanation" / "measured.md"
+PAGE, FIGURES = (ROOT / "docs" / "explanation" / name for name in ("measured.md", "figures.md"))
 # Section of the kept figures of ``make bench-latency``.
 LATENCY = "latency"
+# The kept rows of simulated stages in README; the others stand on the page of figures.
+IN_README = ("accuracy", "calibrator", "confusion pair", "learning")
 # Methods whose figures stand in README. The best of all others has a column of its own.
 COLUMNS = ("PI", "PI, lag", "SLPI", "SLPI, causes")
 Rows = Mapping[str, Mapping[str, Mapping[str, Any]]]
 
 
+def by_device(rows: Rows, manifest: Manifest) -> dict[str, str]:
+    """Return the label of README's row for each device whose motion was measured, with its name.
+
+    It is the row with the median ratio of the error of SLPI with causes to that of the best other method; of two
+    middle rows the worse one.
+    """
+    ratios: dict[str, list[tuple[float, str]]] = {}
+    names = {}
+    for task in manifest.tasks:
+        source = manifest.records[task.judged[0].record].source
+        for part in task.judged:
+            label = f"{task.name}: {part}"
+            names[label] = part.name
+            if manifest.sources[source].moves:
+                least = min(float(cell["rms"]) for name, cell in rows[label].items() if _other(name, cell))
+                ratios.setdefault(source, []).append((float(rows[label]["SLPI, causes"]["rms"]) / least, label))
+    chosen = [sorted(found)[len(found) // 2][1] for found in ratios.values()]
+    return {label: names[label] for label in chosen}
+
+
+def _other(name: str, cell: Mapping[str, Any]) -> bool:
+    return not name.startswith("SLPI") and "rms" in cell
+
+
 def readme_table(rows: Rows, manifest: Manifest, date: str, command: str) -> str:
-    """Return the table of README, a row for each judged part, after a summary."""
-    judged = "judged (fitted parts: [manifest](benchmarks/measured/manifest.json))"
+    """Return the table of README, a row for each device, and what all rows come to."""
     lines = [
-        f"| source | {judged} | {' | '.join(COLUMNS)} | best of the other methods |",
-        f"|---|---|{'---|' * len(COLUMNS)}---|",
+        f"| device, judged on | {' | '.join(COLUMNS)} | best of the other methods |",
+        f"|---|{'---|' * len(COLUMNS)}---|",
     ]
-    tasks = {task.name: task for task in manifest.tasks}
-    for label, row in rows.items():
-        name, part = label.split(": ", 1)
-        record = manifest.records[tasks[name].judged[0].record]
-        source = manifest.sources[record.source]
-        link = f"[{source.repository.split('/')[1]}](https://github.com/{source.repository}/tree/{source.commit})"
-        marked = marks(row)
+    for label, name in by_device(rows, manifest).items():
+        row, marked = rows[label], marks(rows[label])
         cells = [_cell(row.get(column, {}), marked.get(column, "")) for column in COLUMNS]
         others = {other: cell for other, cell in row.items() if other not in COLUMNS and "rms" in cell}
-        best = min(others, key=lambda other: float(others[other]["rms"]), default=None)
-        last = f"{_cell(others[best], marked.get(best, ''))} {best}" if best else "-"
-        lines.append(f"| {link} | {name}: {part} | {' | '.join(cells)} | {last} |")
+        best = min(others, key=lambda other: float(others[other]["rms"]))
+        cells.append(f"{_cell(others[best], marked.get(best, ''))} {best}")
+        lines.append(f"| {name} | {' | '.join(cells)} |")
     ours = [[marks(row).get(column, "") for column in ("SLPI", "SLPI, causes")] for row in rows.values()]
     wins, near = sum("*" in found for found in ours), sum(any(found) for found in ours)
     count = max(len(row) for row in rows.values())
-    first = (
-        f"{_cost(rows)} Of {count} methods, SLPI with or without causes is the best in {wins} of {len(rows)} rows, and "
-        f"the best or within its 95 % interval of it in {near}."
-    )
     said = (
-        f"Free-run rms error without its mean on parts that were not fitted, % of their range; {date}, `{command}`. "
-        f"Bold: the best of the row, of all {count} methods; =: the best is within the 95 % interval of this one. "
-        "[All methods, with intervals, offsets, inverses and times](docs/explanation/measured.md)."
+        f"Rms error of the model from voltages alone, without its mean, on data that were not fitted, in % of their "
+        f"range; {date}, `{command}`. **Bold**: the best of {count} methods; *equal*: not significantly worse than the "
+        f"best (95 %). A device whose motion was measured has one row: the one with the median ratio of *SLPI, causes* "
+        f"to the best other method, of two the worse one. [All {len(rows)} rows, all methods]"
+        f"(docs/explanation/measured.md): SLPI, with or without causes, is the best in {wins}, and the best or equal "
+        f"in {near}. {_cost(rows)}"
     )
-    return "\n".join([first, "", *lines, "", said])
+    return "\n".join([*lines, "", said])
 
 
 def _cost(rows: Rows) -> str:
@@ -71,16 +90,26 @@ def _cost(rows: Rows) -> str:
     ]
     fit, sample = (np.median([cell[key] for cell in ours]) for key in ("fit_seconds", "sample_microseconds"))
     return (
-        f"In the median of the rows, the error of the classical model PI is {gains[0]:.1f} times that of SLPI with "
-        f"causes, that of PI with a lag {gains[1]:.1f} times; the fit takes {fit:.0f} s of a "
-        f"processor, a sample of a free run {sample:.1f} µs."
+        f"In the median row the error of the classical model PI is {gains[0]:.1f} times that of *SLPI, causes*, that "
+        f"of PI with a lag {gains[1]:.1f} times; the fit takes {fit:.0f} s on one core, a sample {sample:.1f} µs."
     )
 
 
-def full_tables(rows: Rows, date: str, command: str) -> str:
+def what_is_judged(manifest: Manifest) -> list[str]:
+    """Return the lines of a table: what each row is, what was fitted, and where the records are from."""
+    lines = ["| row | what is judged | fitted to | records |", "|---|---|---|---|"]
+    for task in manifest.tasks:
+        source = manifest.sources[manifest.records[task.judged[0].record].source]
+        link = f"[{source.repository.split('/')[1]}](https://github.com/{source.repository}/tree/{source.commit})"
+        fitted = "; ".join(map(str, task.fitted))
+        lines += [f"| {task.name}: {part} | {part.name} | {fitted} | {link} |" for part in task.judged]
+    return lines
+
+
+def full_tables(rows: Rows, manifest: Manifest, date: str, command: str) -> str:
     """Return the tables of the page: every method on every row."""
     names = list(dict.fromkeys(name for row in rows.values() for name in row))
-    parts = [f"{date}, `{command}`."]
+    parts = [f"{date}, `{command}`.", "", "### What is judged", "", *what_is_judged(manifest)]
     for title, figure, text in (
         ("Without the mean error", "rms", "{0[rms]:.3f} ({0[low]:.3f} to {0[high]:.3f})"),
         ("With the mean error", "absolute", "{0[absolute]:.3f}"),
@@ -100,7 +129,7 @@ def full_tables(rows: Rows, date: str, command: str) -> str:
 
 
 def latency_line(section: Mapping[str, Any]) -> str:
-    """Return the sentence of README on the latency."""
+    """Return the sentence on the latency."""
     echo, compensator = (section["figures"]["events"][name] for name in ("echo", "compensator"))
     return (
         f"Latency of the compensator, from a desired displacement to its voltage over DDS at 1 kHz, two axes: median "
@@ -110,10 +139,11 @@ def latency_line(section: Mapping[str, Any]) -> str:
     )
 
 
-def rows_table(rows: Mapping[str, Mapping[str, str]]) -> str:
-    """Return the table of README on all other figures: a row for each that is kept."""
+def rows_table(rows: Mapping[str, Mapping[str, str]], names: Iterable[str]) -> str:
+    """Return the table of other kept figures: a row for each of these names."""
     lines = ["| what | measured | command | date |", "|---|---|---|---|"]
-    lines += [f"| {row['what']} | {row['measured']} | `{row['command']}` | {row['date']} |" for row in rows.values()]
+    chosen = [rows[name] for name in names]
+    lines += [f"| {row['what']} | {row['measured']} | `{row['command']}` | {row['date']} |" for row in chosen]
     return "\n".join(lines)
 
 
@@ -121,7 +151,7 @@ def _cell(cell: Mapping[str, Any], mark: str) -> str:
     if "rms" not in cell:
         return "refused"
     figure = f"{cell['rms']:.3f}"
-    return f"**{figure}**" if mark == "*" else f"{figure} {mark}".strip()
+    return {"*": f"**{figure}**", "=": f"*{figure}* equal"}.get(mark, figure)
 
 
 def with_part(text: str, name: str, part: str) -> str:
@@ -134,13 +164,16 @@ def with_part(text: str, name: str, part: str) -> str:
 
 
 def pages() -> dict[Path, str]:
-    """Return README and the page on measured records as the kept figures want them."""
-    section, latency = kept.read(SECTION), kept.read(LATENCY)
+    """Return README and the pages of figures as the kept figures want them."""
+    section, others, manifest = kept.read(SECTION), kept.read(kept.ROWS), read_manifest()
     rows, date, command = section["figures"], section["date"], section["command"]
-    readme = with_part(README.read_text("utf-8"), "measured", readme_table(rows, read_manifest(), date, command))
-    readme = with_part(readme, "latency", latency_line(latency))
-    readme = with_part(readme, "rows", rows_table(kept.read(kept.ROWS)))
-    return {README: readme, PAGE: with_part(PAGE.read_text("utf-8"), "measured", full_tables(rows, date, command))}
+    readme = with_part(README.read_text("utf-8"), "measured", readme_table(rows, manifest, date, command))
+    readme = with_part(readme, "rows", rows_table(others, IN_README))
+    rest = [name for name in others if name not in IN_README]
+    figures = with_part(FIGURES.read_text("utf-8"), "rows", rows_table(others, rest))
+    figures = with_part(figures, "latency", latency_line(kept.read(LATENCY)))
+    measured = with_part(PAGE.read_text("utf-8"), "measured", full_tables(rows, manifest, date, command))
+    return {README: readme, FIGURES: figures, PAGE: measured}
 
 
 def draw(rows: Rows, path: Path) -> None:

@@ -123,20 +123,12 @@ def _judged(
     model: Fitted, tables: Tables, task: Task, span: Span, records: Sequence[Series], took: float
 ) -> Score | str:
     one = tables.series(span.record, task.axis, [span])
-    chooses, judged = _split(one, records)
-    runs, seconds = [], []
-    histories = possible_histories(records)
-    for history in histories:
-        began = time.process_time()
-        try:
-            with warnings.catch_warnings():
-                warnings.simplefilter("ignore")
-                runs.append(model.simulate(one.name, one.t, one.v, history))
-        except SlpiError as refusal:
-            return f"{type(refusal).__name__}: {refusal}"
-        seconds.append(time.process_time() - began)
-    best = min(range(len(runs)), key=lambda k: float(np.std((runs[k] - one.y)[chooses])))
-    error = (runs[best] - one.y)[judged]
+    try:
+        run, history, seconds = free_run(model, one, records)
+    except SlpiError as refusal:
+        return f"{type(refusal).__name__}: {refusal}"
+    judged = _split(one, records)[1]
+    error = (run - one.y)[judged]
     share = 100.0 / float(np.ptp(one.y[judged]))
     mean = float(np.mean(error))
     low, high = interval(share * (error - mean))
@@ -146,10 +138,25 @@ def _judged(
         high=high,
         absolute=share * float(np.sqrt(np.mean(error**2))),
         fit_seconds=took,
-        sample_microseconds=1e6 * min(seconds) / one.t.size,
-        inverse=_inverse(model, replace(one, y=one.y + mean), judged, histories[best]),
+        sample_microseconds=1e6 * seconds / one.t.size,
+        inverse=_inverse(model, replace(one, y=one.y + mean), judged, history),
         said=str(getattr(model, "said", "")),
     )
+
+
+def free_run(model: Fitted, one: Series, records: Sequence[Series]) -> tuple[FloatArray, tuple[float, ...], float]:
+    """Return the free run of a judged record (N,), its history, V, and the least processor time of one, s."""
+    chooses, _ = _split(one, records)
+    runs, seconds = [], []
+    histories = possible_histories(records)
+    for history in histories:
+        began = time.process_time()
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            runs.append(model.simulate(one.name, one.t, one.v, history))
+        seconds.append(time.process_time() - began)
+    best = min(range(len(runs)), key=lambda k: float(np.std((runs[k] - one.y)[chooses])))
+    return runs[best], histories[best], min(seconds)
 
 
 def _split(one: Series, records: Sequence[Series]) -> tuple[Mask, Mask]:

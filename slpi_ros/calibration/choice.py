@@ -68,5 +68,7 @@ def _promises(found: AxisDiagnosis | None) -> list[tuple[str, float, str]]:
         for named in found.effects:
             if not named.alternatives:
                 share = CONFIRMED * named.share_of_residual
-                offers.append((named.name, share, f"{named.name} is named; a drive of its own tells its parameters"))
+                offers.append(
+                    (named.name, share, f"{named.name} is named; a drive of its own determines its parameters")
+                )
     return offers

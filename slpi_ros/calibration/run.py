@@ -71,8 +71,8 @@ class TrackingError:
     mean: float  # of the magnitude
     rms: float
     maximum: float
-    offset: float  # the constant part: the median
-    rest: float  # mean of the magnitude without the constant part
+    offset: float  # the median
+    rest: float  # mean of the magnitude without the offset
     stroke: float  # displacement range of the model
     goal: float  # largest mean error that meets the target
     t: FloatArray  # s, from the first stamp of the record
@@ -88,7 +88,7 @@ class TrackingError:
         """Return the error in words."""
         return (
             f"mean error {length(self.mean)} ({self.mean / self.stroke:.3%} of the stroke), maximum "
-            f"{length(self.maximum)}; of it constant {length(self.offset)}, the rest {length(self.rest)}"
+            f"{length(self.maximum)}; offset {length(self.offset)}, mean error without it {length(self.rest)}"
         )
 
 
@@ -174,7 +174,7 @@ class _Calibration:
         first = self._identify()
         self._verify(first)
         self._survey()
-        ended = "no further record promises to tell more"
+        ended = "no further record is expected to add information"
         for _ in range(MOST_ROUNDS):
             diagnosis = self._diagnose(first)
             while choice := next_drive(settings, diagnosis.axes, self._drives, self._left):
@@ -183,7 +183,7 @@ class _Calibration:
             if self._left < 0.0:
                 ended = "the time budget is spent"
                 break
-            # No diagnosis makes the constant part smaller.
+            # No diagnosis makes the offset smaller.
             if all(error.rest <= error.goal for error in self._verify(diagnosis.extended).values()):
                 break
         goals = {axis: settings.goal(rms) for axis, rms in self._repeatability.items()}

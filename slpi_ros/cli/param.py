@@ -11,7 +11,7 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument("node", metavar="NODE", help="name of the node, as /compensator")
     command.add_argument("name", metavar="NAME", help="name of the parameter")
     command.add_argument(
-        "value", metavar="VALUE", nargs="?", help="new value; [1.0, 2.0] for several axes; default: it is only told"
+        "value", metavar="VALUE", nargs="?", help="new value; [1.0, 2.0] for several axes; default: it is only shown"
     )
 
 
@@ -40,7 +40,7 @@ def _shown(value: Any) -> str:
 
 
 COMMAND = Command(
-    "tell or set a parameter of a running node",
+    "show or set a parameter of a running node",
     "slpi param /compensator feedback true",
     _add_options,
     _run,

@@ -19,11 +19,11 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument(
         "--tolerance", metavar="UM", type=float,
         help="largest absolute rms error that passes, micrometres; default: three times the repeatability of the "
-        "record, at least 0.02 %% of the stroke, for the error without its constant part",
+        "record, at least 0.02 %% of the stroke, for the error without its offset",
     )  # fmt: skip
     command.add_argument(
         "--without-offset", action="store_true",
-        help="the tolerance holds for the error without its constant part; default: for the absolute error",
+        help="the tolerance holds for the error without its offset; default: for the absolute error",
     )  # fmt: skip
     command.add_argument(
         "--certificate", action="store_true",

@@ -235,7 +235,7 @@ def _evidence(name: str, unit: str, share: float, x: FloatArray, fitted: FloatAr
         return f"{length(fitted[k])} at {_quantity(x[k], unit)}{branch}"
 
     extremes = at(int(np.argmin(fitted))), at(int(np.argmax(fitted)))
-    return f"{share:.0%} of the mean square goes with the {name}: from {extremes[0]} to {extremes[1]}"
+    return f"{share:.0%} of the mean square depends on the {name}: from {extremes[0]} to {extremes[1]}"
 
 
 def _quantity(value: float, unit: str) -> str:

@@ -275,16 +275,15 @@ def _evidence(effect: Effect, named: Named, chance: float, in_the_end: Score) ->
     before, after, without, end = (
         length(held_out_error(score, own=named.own)) for score in (named.before, named.after, named.without, in_the_end)
     )
-    on = "records" if named.after.records.size and not named.own else "blocks"
+    on = "other records" if named.after.records.size and not named.own else "other parts of the record"
     gained = (
-        f"{effect.describe()}; with it the error on held-out {on} falls from {before} to {after} rms; "
-        f"without it {without} would be left in the end, not {end} "
-        f"(p = {chance:.2g}, on blocks: the probability that chance gains as much)"
+        f"{effect.describe()}; held-out error, on {on}: {before} before, {after} rms with it; all effects found "
+        f"{end}, the same without this one {without} (p = {chance:.2g} that chance gains as much)"
     )
     if not named.runner_up:
-        return f"{gained}, and no other effect comes near"
+        return f"{gained}; no other effect lowers it as much"
     other, rms = named.runner_up
-    return f"{gained}, with {other} in its place {length(rms)}"
+    return f"{gained}; with {other} instead {length(rms)}"
 
 
 def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], noise_rms: float) -> str:
@@ -310,11 +309,11 @@ def signals_of(now: Explanation) -> list[Signals]:
 def _goes_with(left: Sequence[Left], verdict: str, records: Sequence[Signals]) -> str:
     if left:
         others = [f"{one.variable} ({one.share:.0%})" for one in left[1:]]
-        return f" Of what is left, {left[0].evidence}." + (f" Beside that: {', '.join(others)}." if others else "")
+        return f" Remaining error: {left[0].evidence}." + (f" Also: {', '.join(others)}." if others else "")
     if verdict not in (UNEXPLAINED, PARTLY_NAMED):
         return ""
     return (
-        f" No measured variable predicts what is left; half of its mean square is below {half_power(records):.3g} Hz."
+        f" No recorded variable predicts the remaining error; half of its power is below {half_power(records):.3g} Hz."
     )
 
 
@@ -341,14 +340,17 @@ def _of_given(given: Given, selection: Selection, before_rms: float) -> str:
 
 def _in_model(now: Explanation, effects: Sequence[NamedEffect], dropped: Sequence[str]) -> str:
     own = [effect.name for effect in now.effects if isinstance(effect, EachRecord)]
-    said = f" Each record's own, and not in the extended model: {', '.join(own)}." if own else ""
+    said = f" Each record has its own, so not in the extended model: {', '.join(own)}." if own else ""
     if undecided := [named.name for named in effects if named.alternatives and named.name not in own]:
         said += (
             f" In the extended model as one of several possible causes: {', '.join(undecided)}; proved at the drive "
             "rates of these records only."
         )
     if dropped:
-        said += f" Dropped, as they leave too much or as what they gain does not hold elsewhere: {', '.join(dropped)}."
+        said += (
+            f" Tried and not in the model, as the remaining error is too large or the gain does not hold on held-out "
+            f"data: {', '.join(dropped)}."
+        )
     return said
 
 
@@ -361,9 +363,9 @@ def _summary(
     verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], noise_rms: float, before_rms: float
 ) -> str:
     after = selection.now.held_out.rms_of_records
-    left = f"{length(after)} rms are left, the sensor noise is {length(noise_rms)}"
+    left = f"the remaining error is {length(after)} rms, the sensor noise {length(noise_rms)}"
     found = ", then ".join(
-        f"{named.name}, which reduces {'the rest' if place else 'the error'} by {named.gain_percent:.0f} %"
+        f"{named.name}, which reduces {'the remaining error' if place else 'the error'} by {named.gain_percent:.0f} %"
         for place, named in enumerate(effects)
     )
     if verdict == NOTHING_FOUND:
@@ -377,13 +379,13 @@ def _summary(
     if verdict == AMBIGUOUS:
         open_ones = (named for named in effects if named.alternatives)
         others = "".join(f" The record cannot tell {one.name} from {', '.join(one.alternatives)}." for one in open_ones)
-    return f"{structure}Found: {found}.{others} The held-out error falls from {length(before_rms)}; {left}."
+    return f"{structure}Found: {found}.{others} The held-out error was {length(before_rms)} before; {left}."
 
 
 def _cannot_tell(driven_alike: Sequence[str]) -> str:
     if not driven_alike:
         return ""
-    return f" Axis {', '.join(driven_alike)} has the same drive: whether it couples into this one cannot be told."
+    return f" Axis {', '.join(driven_alike)} has the same drive: its coupling into this one cannot be identified."
 
 
 def _looked_at(evidence: Evidence, effects: Sequence[NamedEffect]) -> str:
@@ -391,7 +393,7 @@ def _looked_at(evidence: Evidence, effects: Sequence[NamedEffect]) -> str:
     followed = {key for named in effects for key in named.effect.keys}
     others = [key for key in evidence.surroundings if key not in followed]
     return (
-        f" Recorded quantities that were tried and are no cause as far as these records tell: {', '.join(others)}."
+        f" Recorded quantities that were tried and have no effect in these records: {', '.join(others)}."
         if others
         else ""
     )
@@ -413,7 +415,7 @@ def _next(
         first = next((named for named in effects if named.alternatives), effects[0])
         steps.append(_separating((first.name, *first.alternatives), selection.now.evidence))
     if verdict == PARTLY_NAMED and left:
-        steps.append(f"For what is left, {hint(left[0].variable)}.")
+        steps.append(f"For the remaining error, {hint(left[0].variable)}.")
     elif verdict in (UNEXPLAINED, PARTLY_NAMED) and not steps:
         steps.append(_more_loops(selection.now.evidence))
     return " ".join(steps) or None

@@ -30,7 +30,7 @@ CAUSES = {
     "what is known of the path, so as a trajectory",
     "rate": "loops wider or narrower than those of the model, the faster the more: slpi diagnose on faster records",
     "command": "the voltages are not those of this model: slew limit, feedback, a reset, another model, or a computer "
-    "that was busy, which the log of the compensator tells",
+    "that was busy, see the log of the compensator",
     "model": "the hysteresis and what else the model does not hold: slpi diagnose, slpi refit",
     "noise": "what does not repeat: sensor noise, vibration, line interference",
 }

@@ -298,7 +298,7 @@ def verify(
         Desired displacement of each record at its samples, NaN where there was none. If given, the tracking error of
         the compensator is evaluated as well.
     without_offset : bool
-        Whether the tolerance holds for the error without its constant part. Default False.
+        Whether the tolerance holds for the error without its offset. Default False.
     start, stop : float, seconds, optional
         Judge only samples with ``start <= t < stop``; t is counted from the first stamp of each record.
     start_memory : {"end", "start", "wiped"}, optional

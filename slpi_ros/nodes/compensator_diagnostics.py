@@ -297,7 +297,7 @@ class Reporter:
         for axis in controller.axes if ready else ():
             beyond, moving = axis.path.beyond, since("accepted") > 0
             if beyond and axis.name not in self._beyond_before:
-                advice = "errors may be larger than told, record at that rate (slpi excite --for-path)"
+                advice = "errors may be larger than stated, record at that rate (slpi excite --for-path)"
                 yield Problem(f"{axis.name} beyond", WARN, f"axis '{axis.name}': {beyond}; {advice}")
             alarm, since_busy = settings.values["drift_alarm"], self.measured - self._disturbed
             for kind, level, text in _axis_problems(axis, alarm, moving, since_busy):
@@ -401,7 +401,7 @@ def remedy(axis: Axis, drift: Drift, since_busy: float = math.inf) -> str:
     if axis.confidence.state not in (KNOWN, RESTORED):
         # What an assumed memory adds is no vibration.
         rest = NO_CONSTANT * drift.rms > abs(drift.mean)
-        other = "; if that does not help, record it: slpi verify tells vibration and interference"
+        other = "; if that does not help, record it: slpi verify shows vibration and interference"
         return f"reset the memory (~/reset_memory){other if rest else ''}"
     if abs(drift.mean) > CONSTANT * drift.rms:
         return f"the zero, from the {axis.zero.source}, has moved; call ~/set_zero, or switch the feedback on"

@@ -25,7 +25,7 @@ DECLARATIONS = (
         declare.scalar("noise_rms", 8e-9, "Sensor noise, metres rms.", (0.0, 1.0)),
         declare.scalar("voltage", 0.0, "Voltage at the outputs at the start, volts of the device.", declare.VOLTAGE),
         Declaration("servo", False, f"{', '.join(WITH_SERVO)}: whether the servo is on at the start."),
-        declare.text("unit", "UM", "gcs: the unit of its positions, as PUN? tells it.", *UNITS),
+        declare.text("unit", "UM", "gcs: the unit of its positions, as PUN? reports it.", *UNITS),
         declare.scalar("answer_delay", 0.0003, "Time until an answer, seconds.", (0.0, 10.0)),
     ),
     declare.text(

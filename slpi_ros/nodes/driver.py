@@ -67,7 +67,7 @@ DECLARATIONS = declare.read_only(
     declare.each_axis(
         "sensor_scale", math.nan,
         "Displacement for one unit of the device's position, metres; negative where they count against each other. "
-        f"NaN: of the unit that the device tells, {USUAL_SCALE:g} where it tells none.",
+        f"NaN: of the unit that the device reports, {USUAL_SCALE:g} where it reports none.",
         (-1.0, 1.0),
     ),
     declare.each_axis("sensor_offset", 0.0, "Added to the displacement, metres.", (-1.0, 1.0)),
@@ -83,7 +83,7 @@ DECLARATIONS = declare.read_only(
     declare.scalar(
         "voltage_timeout", 5.0,
         "Seconds without a voltage_command, from the last one that was carried out on, after which the output is held "
-        "and this is told; 0: never.",
+        "and this is reported; 0: never.",
         (0.0, 86_400.0),
     ),
     declare.text(
@@ -97,7 +97,7 @@ DECLARATIONS = declare.read_only(
     ),
     declare.text(
         "hardware_id", "",
-        "Identifier of the stage in stage_state; empty: model and serial number of the device, if it tells them.",
+        "Identifier of the stage in stage_state; empty: model and serial number of the device, if it reports them.",
     ),
     declare.REALTIME_PRIORITY,
 )  # fmt: skip

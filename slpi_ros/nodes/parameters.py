@@ -151,7 +151,7 @@ REALTIME_PRIORITY = Declaration(
     read_only=True, between=(0, 99),
 )  # fmt: skip
 ACCEPT_STAGE = text(
-    "accept_stage", "", "Name of a stage that is taken for this one, which is told at every start; empty: none.",
+    "accept_stage", "", "Name of a stage that is taken for this one, which is logged at every start; empty: none.",
     read_only=True,
 )  # fmt: skip
 # Of simulators.

@@ -47,7 +47,7 @@ def page_of(outcome: Outcome) -> Page:
         ("", "error before and after", *outcome.errors),
         _errors(outcome),
         None,
-        "Mean and maximum error; mean without the constant part.",
+        "Mean and maximum error; mean without the offset.",
     )
     for axis, error in outcome.errors.items():
         found = outcome.diagnosis.axes[axis]
@@ -56,8 +56,8 @@ def page_of(outcome: Outcome) -> Page:
         page.tiles({
             "verified error, mean": length(error.mean),
             "of the stroke": f"{error.mean / error.stroke:.3%}",
-            "of it constant": length(error.offset),
-            "mean without it": length(error.rest),
+            "offset": length(error.offset),
+            "mean without offset": length(error.rest),
             "maximum": length(error.maximum),
             "target": length(error.goal),
             "repeatability, rms": length(found.repeatability_rms),

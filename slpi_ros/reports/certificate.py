@@ -29,7 +29,7 @@ PROGRAMS = "slpi_ros", "numpy", "scipy"
 METHOD = (
     "The voltage of each record is given to the model, and the displacement that it computes (free run, without any "
     "reading of the sensor) is compared with the measured one: the error is measured - model.",
-    "An error is absolute; the one without offset is that without the constant part of each record.",
+    "An error includes its offset, unless the line says without offset: then the mean of each record is subtracted.",
     "Known delay, lag and periodic error of the sensor are taken out of its readings first.",
     "A record proves something only if the model was not identified from it.",
 )
@@ -135,7 +135,7 @@ def _verdict(document: dict[str, Any]) -> str:
         return f"The absolute error of the model is {length(worst['rms_m'])} rms{limit}.{dependent}"
     why = "the tolerance is not for it" if document["tolerance_m"] else "no tolerance for it was given"
     return (
-        f"The error of the model without its constant part is {length(worst['rest_rms_m'])} rms{limit}; the absolute "
+        f"The error of the model without its offset is {length(worst['rest_rms_m'])} rms{limit}; the absolute "
         f"error is {length(max(one['rms_m'] for one in deciding))}: {why}.{dependent}"
     )
 

@@ -42,7 +42,7 @@ def check_device(name: str, found: Found, channels: Sequence[str], positions: Fl
             checks.append(Check(FAILED, f"{told}: it is at {v:.4g} V, outside its own range; look at its display"))
         if not math.isfinite(low) or not math.isfinite(high):
             checks.append(
-                Check(NOTE, f"{told}: it does not tell its own range: voltage_min and voltage_max are the only guard")
+                Check(NOTE, f"{told}: it does not report its own range: voltage_min and voltage_max are the only guard")
             )
         if not math.isfinite(x):
             checks.append(Check(NOTE, f"{told}: no position: no calibration is possible with this device alone"))
@@ -55,7 +55,10 @@ def check_device(name: str, found: Found, channels: Sequence[str], positions: Fl
             )  # fmt: skip
         if abs(setpoint - v) > 1e-3 * max(abs(v), 1.0):
             checks.append(
-                Check(NOTE, f"{told}: it was told {setpoint:.6g} V and says {v:.6g} V: the first step may be as large")
+                Check(
+                    NOTE,
+                    f"{told}: its setpoint is {setpoint:.6g} V, it reports {v:.6g} V: the first step may be as large",
+                )
             )
     return checks + [Check(NOTE, f"{name}: {note}") for note in found.notes]
 
@@ -97,7 +100,7 @@ def device_parameters(kind: str, address: str, found: Found, channels: Sequence[
     scaled = [f"    # Metres for one unit of the position in the table ({unit}).", f"    sensor_scale: {scale:.1e}"]
     if any(found.units):
         told = ", ".join(map(shown, found.units))
-        scaled = ["    # Metres for one unit of the position; .nan: " + f"as the device tells ({told}).",
+        scaled = ["    # Metres for one unit of the position; .nan: " + f"as the device reports ({told}).",
                   "    sensor_scale: .nan"]  # fmt: skip
     return [
         "driver:",

@@ -103,9 +103,9 @@ def _show_causes(page: Page, found: AxisDiagnosis) -> None:
 
 def _show_left(page: Page, name: str, found: AxisDiagnosis) -> None:
     """Add which measured variables go with what is left, and charts of the residual over these."""
-    page.section("What is left")
+    page.section("Remaining error")
     if not found.left:
-        page.text("None of the measured variables predicts what is left on held-out data.")
+        page.text("No recorded variable predicts the remaining error on held-out data.")
         return
     rows = [[one.variable, f"{one.share:.0%}", one.evidence] for one in found.left]
     caption = (

@@ -31,7 +31,7 @@ def write_files(folder: Path, outcome: LearnOutcome) -> None:
     page.contents(tuple(outcome.learner.axes))
     page.text(
         "The desired path is corrected from pass to pass. The error of a pass is measured - desired without the mean "
-        "and the drift of the pass, which do not repeat and are told beside it; the absolute error holds both."
+        "and the drift of the pass, which do not repeat and are given beside it; the absolute error includes both."
     )
     for name, axis in outcome.learner.axes.items():
         own = [each for each in outcome.passes if name in each.reports]
@@ -110,7 +110,7 @@ def _amplitudes(error: FloatArray) -> FloatArray:
 
 def _table(axis: AxisLearner) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     shown = axis.passes if len(axis.passes) <= MOST_ROWS else [*axis.passes[:10], *axis.passes[10 - MOST_ROWS :]]
-    header = ("pass", "error, rms", "absolute", "mean", "drift", "left out", "what was made of it")
+    header = ("pass", "error, rms", "absolute", "mean", "drift", "left out", "how it was used")
     return header, [
         (
             str(one.number), length(one.error), length(one.absolute), length(one.offset), length(one.drift),

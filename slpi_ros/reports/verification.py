@@ -188,7 +188,7 @@ def _lacking(record: RecordVerification) -> str:
 def _why_unproved(record: RecordVerification) -> str:
     """Return why nothing is proved (useless readings, the initial state, a record of the fit), and what to do."""
     if record.unusable >= 1.0 - LEAST:
-        return "Too few readings are left: check the sensor and its link, 'slpi doctor' tells what is wrong with them."
+        return "Too few readings are left: check the sensor and its link, 'slpi doctor' says what is wrong with them."
     if record.share >= LEAST and record.judged_error <= record.limit and not record.independent:
         return "The model was identified from this record, so that a small error proves nothing: record another one."
     if record.share >= LEAST and record.judged_error <= record.limit and record.lacking:
@@ -203,10 +203,10 @@ def _why_unproved(record: RecordVerification) -> str:
 
 def _error(record: RecordVerification) -> str:
     error = record.error
-    limit = "" if record.absolute else ", for the rest"
+    limit = "" if record.absolute else ", without offset"
     return (
-        f"measured - model is {length(error.rms)} rms, {length(error.maximum)} at most; of it constant "
-        f"{length(record.constant)}, the rest {length(record.rest.rms)} rms (limit {length(record.limit)}{limit}; "
+        f"measured - model is {length(error.rms)} rms, {length(error.maximum)} at most; offset "
+        f"{length(record.constant)}, without it {length(record.rest.rms)} rms (limit {length(record.limit)}{limit}; "
         f"repeatability {length(record.repeatability_rms)}); {_judged_share(record)}"
     )
 
@@ -240,7 +240,7 @@ def record_notes(record: RecordVerification) -> list[str]:
             f"while the voltage moves {length(record.moving.rms)} rms, while it stands {length(record.standing.rms)}"
         )
     if record.lines:
-        notes.append(f"{LINES}: of the error without its constant part, {record.lines.evidence}")
+        notes.append(f"{LINES}: of the error without its offset, {record.lines.evidence}")
     if record.corrected:
         notes.append(f"errors are those of the stage; taken out of the readings of its sensor: {record.corrected}")
     if record.zero_moved:
@@ -313,7 +313,7 @@ def _figures(axis: AxisVerification) -> dict[str, str]:
     figures = {
         "measured - model, rms": length(axis.overall.rms),
         "at most": length(axis.overall.maximum),
-        "without its constant part, rms": length(axis.rest.rms),
+        "without offset, rms": length(axis.rest.rms),
         f"limit of the {'rms' if worst.absolute else 'rms without the constant'}": length(worst.limit),
         "repeatability, rms": length(worst.repeatability_rms),
         "samples judged": f"{min(record.share for record in axis.records):.0%}",
@@ -338,7 +338,7 @@ def _records_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence
         )
         for record in axis.records
     ]
-    held_to = "rms" if axis.worst.absolute else "rms of the rest"
+    held_to = "rms" if axis.worst.absolute else "rms without offset"
     caption = (
         f"Measured - model, free-run. The limit holds for the {held_to}: the tolerance, else {TIMES_REPEATABILITY:g} "
         "times the repeatability, but at least 0.02 % of the stroke. Repeatability: "

@@ -1,11 +1,13 @@
-"""README and the page on measured records hold the kept figures."""
+"""README and the pages of figures hold the kept figures."""
+
+from dataclasses import replace
 
 import pytest
 
 from benchmarks import kept
 from benchmarks.measured import report
 from benchmarks.measured.bench import SECTION
-from benchmarks.measured.manifest import read_manifest
+from benchmarks.measured.manifest import Manifest, MeasuredRecord, Source, Span, Task, read_manifest
 from benchmarks.measured.methods import METHODS
 
 
@@ -13,7 +15,7 @@ def section():
     return kept.read(SECTION)
 
 
-@pytest.mark.parametrize("path", [report.README, report.PAGE])
+@pytest.mark.parametrize("path", [report.README, report.PAGE, report.FIGURES])
 def test_a_page_holds_the_kept_figures(path):
     assert report.pages()[path] == path.read_text(encoding="utf-8"), "python -m benchmarks.measured.report"
 
@@ -25,31 +27,51 @@ def test_every_row_and_method_is_kept():
     rows = section()["figures"]
     tasks = read_manifest().tasks
     assert set(rows) == {f"{task.name}: {part}" for task in tasks for part in task.judged}
+    assert all(part.name for task in tasks for part in task.judged)
     for label, row in rows.items():
         assert set(row) == {method.name for method in METHODS}, label
 
 
-@pytest.mark.parametrize("figure", ["rms", "absolute"])
-def test_a_changed_figure_is_seen(monkeypatch, figure):
-    found = {name: kept.read(name) for name in KEPT}
-    next(iter(found[SECTION]["figures"].values()))["PI"][figure] += 0.01
+def changed(monkeypatch, found):
+    """Return the pages that differ if these are the kept figures."""
     monkeypatch.setattr(kept, "read", found.__getitem__)
-    changed = {path for path, text in report.pages().items() if text != path.read_text(encoding="utf-8")}
-    assert changed == ({report.README, report.PAGE} if figure == "rms" else {report.PAGE})
+    return {path for path, text in report.pages().items() if text != path.read_text(encoding="utf-8")}
+
+
+@pytest.mark.parametrize(("figure", "pages"), [("rms", {report.README, report.PAGE}), ("absolute", {report.PAGE})])
+def test_a_changed_figure_is_seen(monkeypatch, figure, pages):
+    found = {name: kept.read(name) for name in KEPT}
+    label = next(iter(report.by_device(found[SECTION]["figures"], read_manifest())))
+    found[SECTION]["figures"][label]["PI"][figure] += 0.01
+    assert changed(monkeypatch, found) == pages
 
 
 def test_the_latency_is_in_the_page(monkeypatch):
     found = {name: kept.read(name) for name in KEPT}
     found[report.LATENCY]["figures"]["events"]["compensator"]["p99"] += 100.0
-    monkeypatch.setattr(kept, "read", found.__getitem__)
-    assert report.pages()[report.README] != report.README.read_text(encoding="utf-8")
+    assert changed(monkeypatch, found) == {report.FIGURES}
 
 
-def test_the_rows_are_in_the_page(monkeypatch):
+@pytest.mark.parametrize(("name", "page"), [("accuracy", report.README), ("faults", report.FIGURES)])
+def test_the_rows_are_in_the_pages(monkeypatch, name, page):
     found = {name: kept.read(name) for name in KEPT}
-    next(iter(found[kept.ROWS].values()))["measured"] = "1 m"
-    monkeypatch.setattr(kept, "read", found.__getitem__)
-    assert report.pages()[report.README] != report.README.read_text(encoding="utf-8")
+    found[kept.ROWS][name]["measured"] = "1 m"
+    assert changed(monkeypatch, found) == {page}
+
+
+def test_each_device_that_moves_has_its_median_row():
+    ratio = {"a: one": 2.0, "a: two": 0.5, "a: three": 1.0, "b: one": 0.5, "b: two": 3.0, "c: one": 1.0}
+    rows = {label: {"SLPI, causes": {"rms": value}, "PI": {"rms": 1.0}, "GRU": {}} for label, value in ratio.items()}
+    source = Source("o/a", "0" * 40, "MIT", "device")
+    sources = {"a": source, "b": source, "c": replace(source, moves=False)}
+    columns = {"time_s": "s", "voltage_V": "V", "displacement_um": "um"}
+    records = {label: MeasuredRecord(label[0], ("f",), "e", columns, 1.0, "0" * 64, "") for label in ratio}
+    records["fitted"] = records["c: one"]
+    tasks = tuple(Task(label, "x", (Span("fitted"),), (Span(label, name=label),)) for label in ratio)
+    chosen = report.by_device(
+        {f"{label}: {label}": row for label, row in rows.items()}, Manifest(sources, records, tasks)
+    )
+    assert list(chosen.values()) == ["a: three", "b: two"]
 
 
 def test_a_row_is_kept(tmp_path):

@@ -159,7 +159,7 @@ def test_errors_are_absolute_and_the_latest_verification_counts():
 
 def test_lengths_are_told_in_their_own_unit():
     error = error_of(np.full(4000, 4.6e-6))
-    assert length(error.offset) == "4.6 µm" and "constant 4.6 µm" in error.told() and "e+" not in error.told()
+    assert length(error.offset) == "4.6 µm" and "offset 4.6 µm" in error.told() and "e+" not in error.told()
 
 
 def test_the_zero_of_a_model_is_that_of_the_last_record():

@@ -18,11 +18,11 @@ NOT_RUN = {
     "make build": "has been run before any test of a node",
     "source install/setup.bash": "has been run before any test of a node",
     "export PATH": "the tests have a PATH of their own",
-    "ros2 launch slpi_ros calibrate.launch.py": "launch has no wheels: test_launch_files.py and test_site.py check it",
+    "slpi import measured.csv": "a table of the reader's: test_tutorials.py runs the commands on one",
+    "slpi identify my_bag": "the same",
+    "slpi diagnose my_bag": "the same",
     "ros2 run slpi_ros exciter": "run below by hand, with another seed",
     "ros2 bag record /stage_state -o": "rosbag2 has no wheels: the recorder does the same",
-    "ros2 bag record /stage_state /desired": "rosbag2 has no wheels: the recorder does the same",
-    "ros2 run slpi_ros recorder": "the same node as by hand, with more topics: test_recorder.py",
 }
 # The stage moves faster than in life, and the clock of the other nodes is its own.
 FASTER = {"stage_simulator": "-p speed:=4.0 -p rate:=100.0", "calibrator": "-p use_sim_time:=true -p rate:=100.0"}
@@ -46,6 +46,10 @@ def test_every_command_is_run_or_has_a_reason_why_not():
     assert sorted(not_run) == sorted(NOT_RUN)
     assert not re.search(r"^```(?!bash$|console$|$)", README.read_text(), re.MULTILINE)
     assert len(commands_of(README, "bash", "console")) == len(blocks("bash")) + len(blocks("console"))
+
+
+def test_it_is_read_in_five_minutes():
+    assert len(README.read_text().splitlines()) <= 180
 
 
 def test_links_lead_to_files_and_headings():

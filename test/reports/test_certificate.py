@@ -112,7 +112,7 @@ def test_a_record_of_the_model_proves_nothing(folder, verify):
 
 @pytest.mark.parametrize(
     ("options", "named", "code"),
-    [((), "without its constant part", 0), (("--tolerance", "0.05"), "absolute error", 1)],
+    [((), "without its offset", 0), (("--tolerance", "0.05"), "absolute error", 1)],
 )
 def test_the_headline_names_the_error_that_is_judged(options, named, code, folder, verify):
     record = slpi_ros.read_bag(folder / "today")

@@ -51,6 +51,8 @@ keep_to_own_domain()
 # A shell starts background jobs with SIGINT ignored, and the nodes that tests start and interrupt inherit that.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+# Priority of a test with nodes.
+USUAL = os.getpriority(os.PRIO_PROCESS, 0)
 # No verdict depends on the clock. CI draws the same examples every time; `make test-long` draws more of them.
 CI = bool(os.environ.get("CI"))
 EXAMPLES = int(os.environ.get("SLPI_EXAMPLES", "25"))
@@ -128,8 +130,10 @@ def pytest_xdist_make_scheduler(config: pytest.Config, log: Any) -> Any:
 @pytest.hookimpl(tryfirst=True)
 def pytest_runtest_setup(item: pytest.Item) -> None:
     """Let nodes have the cores when they want them: pure numerics on other workers stand back."""
-    if "PYTEST_XDIST_WORKER" in os.environ and not item.get_closest_marker("ros"):
-        os.setpriority(os.PRIO_PROCESS, 0, max(os.getpriority(os.PRIO_PROCESS, 0), 10))
+    if "PYTEST_XDIST_WORKER" in os.environ:
+        # Only root may go back to the usual priority.
+        with suppress(PermissionError):
+            os.setpriority(os.PRIO_PROCESS, 0, USUAL if item.get_closest_marker("ros") else max(USUAL, 10))
 
 
 def pytest_sessionfinish(session: pytest.Session) -> None:

@@ -28,6 +28,7 @@ STAGE = {"rate": 1000.0, "answer_commands": False, "resonance": MODE, "damping":
 DESIRED = 5e-6
 
 
+@pytest.mark.ros
 @pytest.mark.slow
 @pytest.mark.long
 def test_the_loop_of_the_page_takes_the_error_away(reader):

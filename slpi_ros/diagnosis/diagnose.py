@@ -1,9 +1,8 @@
 """Diagnosis of a model on records: its errors, their causes, and the model extended by them."""
 
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import UTC, datetime
-from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,15 +10,14 @@ from threadpoolctl import threadpool_limits
 
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.arrays.rates import fastest
-from slpi_ros.diagnosis.candidates import contenders, is_own, seen
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged, signals_of
-from slpi_ros.diagnosis.selection import CONVERGED, Named, Selection, select, settled
-from slpi_ros.diagnosis.significance import counts, worse_on_none
+from slpi_ros.diagnosis.ruler import NO_WORSE, beats
+from slpi_ros.diagnosis.search import CONVERGED, Answer, Judge, Search, is_own, seen
 from slpi_ros.diagnosis.structures import BIAS
-from slpi_ros.effects.base import Effect, EffectContext
+from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.chain import Chain
 from slpi_ros.effects.registry import EFFECTS, in_order
 from slpi_ros.errors import SlpiError, UsageError
@@ -34,19 +32,9 @@ from slpi_ros.model.axis_model import ABOVE_NOISE, AxisModel, Start
 from slpi_ros.model.sensor import IDEAL, corrected
 from slpi_ros.model.stage_model import StageModel
 
-# `select`, with where it begins.
-_Select = Callable[[Explanation, Explanation | None], Selection]
 # Kinds that are refitted together with the effects. Any other kind is reported as unsuitable if its error exceeds that
 # of the loop family by this factor.
 REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
-# Effects that leave more than noise are part of the model if they leave at most this share of the error (a third of its
-# mean square), and if the free run of the extended model shows this share of the held-out gain.
-LEFT_OF_ERROR, GAIN_SHOWN = 0.6, 0.5
-# A drift, which may have any course, a recorded quantity, one of several that go up and down, or a cause with
-# alternatives may stand for a wrong hysteresis or for a drift: where more than noise is left, that is at most this
-# share of what is left without it (a tenth of the mean square). At a single drive frequency such a cause only gives the
-# loops another shape, and none that leaves more than this multiple of the repeatability is in the model.
-LEFT_BY_UNSURE, MUCH_LEFT = 0.316, 3.0
 # Gauss-Newton steps of the selected effects with the hysteresis of the given model, which has more vertices; largest
 # ratio, either way, of the errors of the coarser one and with it that are as good.
 REFINED, COARSER = 3, 1.05
@@ -136,14 +124,8 @@ def following(
         undone = [corrected(each, {axis: known.sensor.undo}) if known.sensor else each for each in records]
         with threadpool_limits(1):
             evidence = evidence_of(undone, axis, replace(known, sensor=IDEAL), start, stop)
-            now = Explanation(evidence, ())
-            for _ in evidence.surroundings:
-                report_progress(f"axis {axis}: {len(now.effects)} effects, trying recorded quantities")
-                found = contenders(now, [name for name, effect in EFFECTS.items() if effect.follows_quantities])
-                if not found or not found[0].counts_beside(now):
-                    break
-                now = found[0].explanation
-            now = now.refined(CONVERGED)
+            names = [name for name, effect in EFFECTS.items() if effect.follows_quantities]
+            now = Judge(Search(Explanation(evidence, ()), names=names)).answer().now
             follows = [key for effect in now.effects for key in effect.keys]
             if follows:
                 axes[axis] = replace(_extended(known, now, source), sensor=known.sensor)
@@ -181,66 +163,35 @@ def _diagnose_axis(
     fitted = model.kind in REFITTED
     family = evidence_of(records, axis, None, start, stop) if model.kind == "pi" else None
     runs = [_run(model, part, of_record=same) for part in evidence.parts]
-    before = base.held_out.rms_of_records if fitted else rms_of(runs)
+    before = base.held_out.rms if fitted else rms_of(runs)
     other_kind = not fitted and before > WRONG_KIND * base.held_out.rms
 
-    def attempt(not_first: Collection[str], *, unsure: bool = False) -> _Attempt:
-        chosen = partial(select, not_first=not_first, unsure=unsure)
-        found = _selected(base, family if fitted else None, chosen)
-        if other_kind:
-            found = replace(found, structures=(BIAS, *found.structures))
-        return _attempt(model, found, runs)
-
-    made = attempt(())
-    begun = {effect.name for effect in made.beginnings[:1]}
-    named = {one.name for one in made.selection.named}
-    imitates = not named or any(EFFECTS[name].free_course for name in named)
-    if imitates and not _explains_all(made.selection) and not one_speed(evidence):
-        # What does not hold, or has a free course, may have been in the way of the causes, and of several each may hide
-        # the others: these count if they explain all.
-        again = attempt(begun, unsure=not begun)
-        if again.selection.named and _explains_all(again.selection):
-            made = again
-    selection, given, extension = made.selection, made.given, made.extension
-    # A hysteresis as smooth as beside the effects that were tried takes up less of what is left.
-    signals = signals_of(selection.now)
-    if not (extension or selection.named):
-        # Nothing is explained, so that nothing is fitted beside the hysteresis of the given kind.
-        selection = replace(selection, now=selection.base)
-    extension = extension or _Extension(model, runs, runs)
-    outcomes = _outcomes(runs, extension.runs, selection.now)
-    noise, repeats, alike = selection.now.noise, _repeatability(selection.now), driven_alike(records, axis)
-    found = judged(selection, signals, noise, repeats, before, given, outcomes, alike)
-    if extension.model is model:
-        return found, model
-    diagnosed = replace(extension.model.quality, verdict=found.verdict)
-    return found, replace(extension.model, quality=diagnosed)
-
-
-class _Attempt(NamedTuple):
-    """Selection of effects that hold, the comparison of the given model with the records, and its extension."""
-
-    selection: Selection
-    given: Given
-    extension: "_Extension | None"
-    # Effects with which the selection began, those that do not hold among them.
-    beginnings: tuple[Effect, ...]
-
-
-def _attempt(model: AxisModel, found: Selection, runs: Sequence[FreeRun]) -> _Attempt:
-    """Return what holds of a selection of effects; `runs` are the free runs of the given model."""
-    selection = _without_unsure(found)
-    given = _given(model, runs, selection)
-    source = ", ".join(part.source for part in selection.now.evidence.parts)
-    extension = _extension(model, selection, given, source)
-    if _of_another_kind(selection) or (extension and _not_as_judged(extension.with_own, runs, selection)):
-        # What was judged on held-out blocks is not what all records together give: the causes do not explain them.
-        selection = selection.without({named.name for named in selection.named})
-        given = _given(model, runs, selection)
-        extension = _extension(model, selection, given, source)
-        if extension and _not_as_judged(extension.with_own, runs, selection):
+    found = _answer(base, family if fitted else None)
+    if other_kind:
+        found = replace(found, structures=(BIAS, *found.structures))
+    source = ", ".join(part.source for part in evidence.parts)
+    given = _given(model, runs, found)
+    extension = _extension(model, found, given, source)
+    if extension and not _carries_over(extension.with_own, runs):
+        # What makes a record worse is neither named nor in the model.
+        found = found.without_all()
+        given = _given(model, runs, found)
+        extension = _extension(model, found, given, source)
+        if extension and not _carries_over(extension.with_own, runs):
             extension = None
-    return _Attempt(selection, given, extension, found.beginnings)
+    # A hysteresis as smooth as beside the effects that were tried takes up less of what is left.
+    signals = signals_of(found.now)
+    if not (extension or found.named):
+        # Nothing is explained, so that nothing is fitted beside the hysteresis of the given kind.
+        found = replace(found, now=found.base)
+    extension = extension or _Extension(model, runs, runs)
+    outcomes = _outcomes(runs, extension.runs, found.now)
+    noise, repeats, alike = found.now.noise, _repeatability(found.now), driven_alike(records, axis)
+    told = judged(found, signals, noise, repeats, before, given, outcomes, alike)
+    if extension.model is model:
+        return told, model
+    diagnosed = replace(extension.model.quality, verdict=told.verdict)
+    return told, replace(extension.model, quality=diagnosed)
 
 
 class _Extension(NamedTuple):
@@ -254,62 +205,16 @@ class _Extension(NamedTuple):
     with_own: Sequence[FreeRun]
 
 
-def _extension(model: AxisModel, selection: Selection, given: Given, source: str) -> _Extension | None:
-    """Return the extension of a model by the effects of a selection; None if nothing is to refit."""
+def _extension(model: AxisModel, answer: Answer, given: Given, source: str) -> _Extension | None:
+    """Return the extension of a model by the effects of an answer; None if nothing is to refit."""
     # An effect that the records do not distinguish from others is part of it: at their drive rates each of these
     # predicts the same, and what is left without any is larger than what they differ by at others.
-    if not (given.changed or BIAS in selection.structures or selection.named):
+    if not (given.changed or BIAS in answer.structures or answer.named):
         return None
-    extended = _extended(model, selection.now, source)
-    runs = _runs(extended, selection.now)
-    own = any(isinstance(one, EachRecord) for one in selection.now.effects)
-    return _Extension(extended, runs, _runs(extended, selection.now, own=True) if own else runs)
-
-
-def _without_unsure(selection: Selection) -> Selection:
-    """Return the selection without causes that may stand for a wrong hysteresis; the least helpful one goes first."""
-    while _leaves_more(selection, ABOVE_NOISE):
-        # Of several records, a common effect has held on those that are left out.
-        one = len(selection.now.evidence.parts) == 1
-        unsure = [named for named in selection.named if _is_unsure(named, selection.dropped) and (one or named.own)]
-        left = selection.now.held_out.rms_of_records
-        shares = {named.name: left / named.without.rms_of_records for named in unsure}
-        if not shares or max(shares.values()) <= LEFT_BY_UNSURE:
-            break
-        selection = selection.without({max(shares, key=lambda name: shares[name])})
-    return selection
-
-
-def _is_unsure(named: Named, dropped: Collection[str] = ()) -> bool:
-    effect = EFFECTS[named.name]
-    # What is left of a drift that was dropped looks like creep.
-    anything = effect.free_course or effect.follows_quantities
-    return anything or bool(named.alternatives) or effect.resembles_when_old in dropped
-
-
-def _leaves_more(selection: Selection, multiple: float) -> bool:
-    """Return whether more than a multiple of the repeatability is left."""
-    return selection.now.held_out.rms_of_records > multiple * _repeatability(selection.now).rms
-
-
-def _explains_all(selection: Selection) -> bool:
-    """Return whether no more is left than the sensor's noise."""
-    return selection.now.held_out.rms_of_records <= ABOVE_NOISE * selection.now.noise
-
-
-def _of_another_kind(selection: Selection) -> bool:
-    """Return whether the effects leave so much that the physics is another, where they would not carry over."""
-    if not selection.named or not _leaves_more(selection, ABOVE_NOISE):
-        return False
-    if _share_left(selection) > LEFT_OF_ERROR:
-        return True
-    unsure = any(_is_unsure(named) for named in selection.named)
-    return unsure and one_speed(selection.now.evidence) and _leaves_more(selection, MUCH_LEFT)
-
-
-def _share_left(selection: Selection) -> float:
-    """Return the share of the held-out error that the effects leave."""
-    return selection.now.held_out.rms_of_records / selection.named[0].before.rms_of_records
+    extended = _extended(model, answer.now, source)
+    runs = _runs(extended, answer.now)
+    own = any(isinstance(one, EachRecord) for one in answer.now.effects)
+    return _Extension(extended, runs, _runs(extended, answer.now, own=True) if own else runs)
 
 
 def _runs(model: AxisModel, now: Explanation, *, own: bool = False) -> list[FreeRun]:
@@ -331,50 +236,39 @@ def _runs(model: AxisModel, now: Explanation, *, own: bool = False) -> list[Free
     return runs
 
 
-def _not_as_judged(after: Sequence[FreeRun], runs: Sequence[FreeRun], selection: Selection) -> bool:
-    """Return whether the free runs `after` of an extended model show another gain than the held-out error."""
-    # They may be worse than those of the given model, `runs`, on none of the records. Where the effects leave more than
-    # what does not repeat, they also show at least `GAIN_SHOWN` of their held-out gain.
-    if not worse_on_none(np.array([run.rms**2 for run in runs]), np.array([run.rms**2 for run in after])):
-        return True
-    shown = 1.0 - rms_of(after) / rms_of(runs)
-    if not selection.named or shown >= GAIN_SHOWN * (1.0 - _share_left(selection)):
-        return False
-    return _leaves_more(selection, ABOVE_NOISE)
+def _carries_over(after: Sequence[FreeRun], runs: Sequence[FreeRun]) -> bool:
+    """Return whether the free runs of an extended model are worse than those of the given one on no record."""
+    return all(one.rms <= NO_WORSE * before.rms for one, before in zip(after, runs, strict=True))
 
 
-def _selected(base: Explanation, of_family: Evidence | None, chosen: _Select) -> Selection:
-    """Return the selection of effects, made with a coarser hysteresis if that is as good, and the joint fit without."""
+def _answer(base: Explanation, of_family: Evidence | None) -> Answer:
+    """Return the answer, found with a coarser hysteresis if that is as good, and the joint fit without effects."""
     evidence, coarse = base.evidence, base.evidence.coarse
-    if coarse is not evidence:
-        quick = Explanation(coarse, base.effects)
-        selection = _of_kind(quick, of_family.coarse if of_family else None, chosen)
-        finest = of_family if of_family and BIAS in selection.structures else evidence
-        # A smoothness that suits few vertices may leave many without any hold.
-        finer = replace(selection.now.evidence, basis=finest.basis, smoothness=evidence.smoothness)
-        now = Explanation(finer, selection.now.effects).smoothed().refined(REFINED)
-        if all(few.held_out.rms <= COARSER * many.held_out.rms for few, many in ((quick, base), (selection.now, now))):
-            as_good = now.held_out.rms <= COARSER * selection.now.held_out.rms
-            return replace(selection, base=base, now=now) if as_good else selection
-        if selection.named and now.held_out.rms <= ABOVE_NOISE * now.noise:
-            # What few vertices left was their own doing, and many may follow what is no hysteresis.
-            start = Explanation(finest, base.effects) if BIAS in selection.structures else base
-            selection = settled(replace(selection, base=base), start, now)
-            if _explains_all(selection):
-                return selection
-    return _of_kind(base, of_family, chosen)
+    if coarse is evidence:
+        return _of_kind(base, of_family)
+    quick = Explanation(coarse, base.effects)
+    answer = _of_kind(quick, of_family.coarse if of_family else None)
+    finest = of_family if of_family and BIAS in answer.structures else evidence
+    # A smoothness that suits few vertices may leave many without any hold.
+    finer = replace(answer.now.evidence, basis=finest.basis, smoothness=evidence.smoothness)
+    now = Explanation(finer, answer.now.effects).smoothed().refined(REFINED)
+    as_good = now.held_out.rms <= COARSER * answer.now.held_out.rms
+    return replace(answer, base=base, now=now) if as_good else answer
 
 
-def _of_kind(base: Explanation, of_family: Evidence | None, chosen: _Select) -> Selection:
-    """Return the selection, with the loop family as hysteresis if clearly better than the kind of `base`."""
+def _of_kind(base: Explanation, of_family: Evidence | None) -> Answer:
+    """Return the answer, with the loop family as hysteresis if that predicts better than the kind of `base`."""
     if of_family is None:
-        return chosen(base, None)
+        return Judge(Search(base)).answer()
     family = Explanation(of_family, base.effects)
-    if counts(base.held_out, family.held_out):
-        return chosen(base, family)
-    selection = chosen(base, None)
-    with_effects = Explanation(of_family, selection.now.effects).refined(2)
-    return chosen(base, family) if counts(selection.now.held_out, with_effects.held_out) else selection
+    found = None
+    if not beats(family.held_out, base.held_out, base.noise):
+        found = Judge(Search(base)).answer()
+        with_effects = Explanation(of_family, found.now.effects).refined(2)
+        if not beats(with_effects.held_out, found.now.held_out, found.now.noise):
+            return found
+    answer = Judge(Search(family)).answer()
+    return replace(answer, base=base, structures=(BIAS, *answer.structures))
 
 
 def _repeatability(now: Explanation) -> Repeatability:
@@ -400,20 +294,20 @@ def _known(part: Part) -> Mask:
     return known if np.count_nonzero(known) >= FEWEST else part.used
 
 
-def _given(model: AxisModel, runs: Sequence[FreeRun], selection: Selection) -> Given:
+def _given(model: AxisModel, runs: Sequence[FreeRun], answer: Answer) -> Given:
     """Compare the given model with the records; raise IdentificationError if it belongs to another stage."""
-    evidence = selection.now.evidence
+    evidence = answer.now.evidence
     motion = float(np.ptp(evidence.y[evidence.used]))
     sources = model.quality.sources
     own = np.array([part.source in sources for part in evidence.parts])
     rms = rms_of(runs)
     if own.any() and not own.all():
         # Some effects within each record would also explain a gain that has changed between records.
-        now = selection.now
+        now = answer.now
         steady = now.only([effect.name for effect in now.effects if not EFFECTS[effect.name].changes_gain])
-        compared = [_since(own, one) for one in (selection.base, steady)]
+        compared = [_since(own, one) for one in (answer.base, steady)]
     else:
-        compared = [_compared(model.hysteresis_only, one) for one in (selection.base, selection.now)]
+        compared = [_compared(model.hysteresis_only, one) for one in (answer.base, answer.now)]
     # Records of the same name may be different ones; then the error differs from the stored one.
     own_rms = model.quality.rms if own.all() and len(sources) == own.size else 0.0
     compared = [replace(one, rms=rms, motion=motion, own_rms=own_rms) for one in compared]
@@ -424,21 +318,21 @@ def _given(model: AxisModel, runs: Sequence[FreeRun], selection: Selection) -> G
         span = max(motion, float(np.ptp(model.displacement_range)))
         require_own(best.hysteresis_rms, best.refitted_rms, span)
     if best.changed:
-        best = replace(best, explained=_fits_anew(model, selection, own, best.hysteresis_rms))
+        best = replace(best, explained=_fits_anew(model, answer, own, best.hysteresis_rms))
     zero = max((run.moved for run in runs), key=abs)
     moved = abs(zero) > ZERO * max(rms, CHANGED * motion)
     return replace(best, zero_moved=zero if moved else None)
 
 
-def _fits_anew(model: AxisModel, selection: Selection, own: Mask, given_rms: float) -> bool:
+def _fits_anew(model: AxisModel, answer: Answer, own: Mask, given_rms: float) -> bool:
     """Return whether effects, or a hysteresis fitted to each new record alone, leave as little as the model once did.
 
     Or a small share of `given_rms` (m), the error of the given hysteresis. `own` are the records of the model, mask of
     shape (records,).
     """
-    evidence = selection.now.evidence
-    allowed = max(AS_ONCE * max(model.quality.held_out_rms, selection.now.noise), LITTLE * given_rms)
-    if min(selection.base.held_out.rms, selection.now.held_out.rms) <= allowed:
+    evidence = answer.now.evidence
+    allowed = max(AS_ONCE * max(model.quality.held_out_rms, answer.now.noise), LITTLE * given_rms)
+    if min(answer.base.held_out.rms, answer.now.held_out.rms) <= allowed:
         return True
     alone = [Explanation(evidence.of_record(k)) for k in np.flatnonzero(~own).tolist()] if own.size > 1 else []
     return bool(alone) and all(one.held_out.rms <= allowed for one in alone)
@@ -523,7 +417,9 @@ def _gain(h: FloatArray, target: FloatArray) -> tuple[float, float]:
 
 def _outcomes(runs: Sequence[FreeRun], runs_after: Sequence[FreeRun], now: Explanation) -> tuple[RecordOutcome, ...]:
     """Return the errors of each record in the free runs of the given and of the extended model."""
-    left_out = [error if np.isfinite(error) else None for error in np.sqrt(now.held_out.records).tolist()] or [None]
+    several = len(now.evidence.parts) > 1
+    errors = np.sqrt(now.held_out.records).tolist()
+    left_out = [error if several and np.isfinite(error) else None for error in errors]
     return tuple(
         RecordOutcome(part.source, before.offset, before.rms, after.rms, other)
         for part, before, after, other in zip(now.evidence.parts, runs, runs_after, left_out, strict=True)
@@ -557,7 +453,7 @@ def _extended(model: AxisModel, now: Explanation, source: str) -> AxisModel:
             samples=y.size,
             source=source,
             fastest=max(fastest(part.t[part.used], part.v[part.used]) for part in evidence.parts),
-            left_out_rms=now.held_out.rms_of_records if np.isfinite(now.held_out.records).any() else None,
+            left_out_rms=now.held_out.rms if len(evidence.parts) > 1 else None,
         ),
     )
     quality = with_statistics(extended.quality, _errors(now), extended.displacement_range)

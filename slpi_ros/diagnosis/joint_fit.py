@@ -16,12 +16,13 @@ from itertools import pairwise
 
 import numpy as np
 import scipy.linalg
-from scipy.optimize import lsq_linear
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
-from slpi_ros.diagnosis.effect_parameters import EachRecord, bounded, certain, free, moved, of_starts, steps
+from slpi_ros.diagnosis.effect_parameters import EachRecord, bounded, certain, free, moved, steps
+from slpi_ros.diagnosis.held_out import Division, HeldOut, Loss, solved
 from slpi_ros.diagnosis.prepare import Evidence, Part
-from slpi_ros.effects.base import Candidate, Effect, EffectContext, longest
+from slpi_ros.diagnosis.ruler import alike_in_a_row
+from slpi_ros.effects.base import Effect, EffectContext, longest
 from slpi_ros.effects.chain import Chain, forward
 from slpi_ros.effects.registry import in_order
 from slpi_ros.errors import ModelError
@@ -45,8 +46,6 @@ SLOWEST = 10.0
 NEAR_MOTION = 0.25
 # Shares of a Gauss-Newton step, tried in this order until one lowers the objective.
 SHARES = (1.0, 0.4, 0.1)
-# Regularisation that keeps the gains unique for collinear columns, relative to the size of the columns.
-ALIKE = 1e-9
 # Initial share of a record, which is never held out.
 BEGINNING = 0.08
 # Largest number of samples that are fitted and held out. Longer records are thinned for this, but hysteresis
@@ -58,29 +57,8 @@ SEEN, UNSEEN, FEWEST_JUDGED = 0.1, 0.02, 200
 # They cannot predict a sample with more than this multiple of the median prediction variance; approximate number of
 # samples of a record at which the variance is computed.
 UNCERTAIN, LOOKED_AT = 10.0, 1000
-# Number of blocks of held-out samples for the comparison of two scores.
-BLOCKS = 40
 # An error below this share of the displacement range is beyond the resolution of any sensor.
 FINEST = 1e-6
-
-
-@dataclass(frozen=True)
-class Score:
-    """Held-out errors of a joint fit of hysteresis and columns."""
-
-    losses: FloatArray  # (blocks,), m^2, mean squares
-    gains: FloatArray  # (k,), of the columns, fitted to all samples
-    records: FloatArray  # (records,), m^2, without offset, fitted to the others; NaN: they cover too little; empty: one
-
-    @property
-    def rms(self) -> float:
-        """Rms error of held-out blocks, metres."""
-        return float(np.sqrt(np.mean(self.losses)))
-
-    @property
-    def rms_of_records(self) -> float:
-        """Rms error of held-out records, metres; of held-out blocks if there are none."""
-        return float(np.sqrt(np.nanmean(self.records))) if np.isfinite(self.records).any() else self.rms
 
 
 class Joint:
@@ -91,7 +69,8 @@ class Joint:
         if like and len(evidence.parts) > 1:
             self.predictable = like.predictable
         self.problem, self.evidence, self.u = evidence.problem(u), evidence, u
-        self._groups = _groups(self.problem, evidence)
+        # The same samples are judged whatever voltage the effects let through.
+        self._groups = like._groups if like else _groups(evidence.problem(evidence.v), evidence)
         self.everything = self.problem.design.rows(np.concatenate(self._groups))
         self._ends = np.cumsum([0, *(rows.size for rows in self._groups)]).tolist()
         # Sample of each row of the problem, and of each fitted row in the order of the groups.
@@ -115,23 +94,71 @@ class Joint:
         return [self.problem.design.rows(rows) for rows in self._groups]
 
     @cached_property
-    def held_out(self) -> tuple[list["_HeldOut"], list["_HeldOut"]]:
-        """Held-out folds, and held-out records if there are several."""
+    def _left(self) -> list[tuple[list[int], Factor, int]]:
+        """Groups left out, the factor of the normal equations of the others, and the record (-1: blocks)."""
         grams = [rows.gram() for rows in self.rows]
-        everything, whole = range(len(grams)), _sum(grams)
+        whole, each = _sum(grams), FOLDS + 1
 
-        def held_out(left: Sequence[int], *, record: bool) -> _HeldOut:
-            count = self._ends[-1] - sum(self._groups[group].size for group in left)
-            gram = whole - _sum([grams[group] for group in left])
-            rest = [group for group in everything if group not in left]
-            samples = self._sample[np.concatenate([self._groups[group] for group in left])]
-            judged = self.predictable[samples] if record else np.empty(0, dtype=bool)
-            return _HeldOut(left, rest, self._factored(gram, count), judged)
+        def left(groups: list[int], record: int = -1) -> tuple[list[int], Factor, int]:
+            count = self._ends[-1] - sum(self._groups[group].size for group in groups)
+            return groups, self._factored(whole - _sum([grams[group] for group in groups]), count), record
 
-        folds = [held_out(everything[fold :: FOLDS + 1], record=False) for fold in range(1, FOLDS + 1)]
+        alone = self._judged_alone
+        folds = [[k * each + fold for k in alone] for fold in range(1, each)] if alone else []
+        records = [k for k in range(len(self.evidence.parts)) if k not in alone]
+        return [*map(left, folds), *(left(list(range(k * each, (k + 1) * each)), k) for k in records)]
+
+    @cached_property
+    def _judged_alone(self) -> list[int]:
+        """Records of which blocks are left out, as the others, if there are any, cover too little of them."""
         if len(self.evidence.parts) == 1:
-            return folds, []
-        return folds, [held_out(everything[k : k + FOLDS + 1], record=True) for k in everything[:: FOLDS + 1]]
+            return [0]
+        covered = [np.count_nonzero(self.predictable[rows]) for rows in self.evidence.slices]
+        judged = [self.predictable[self._samples[slice(*ends)]] for ends in pairwise(self._ends)]
+        rows = [sum(np.count_nonzero(own) for own in judged[k * (FOLDS + 1) + 1 : (k + 1) * (FOLDS + 1)]) for k in range(len(covered))]
+        return [k for k, count in enumerate(rows) if count < FEWEST_JUDGED]
+
+    def held_out(self, at: FloatArray) -> HeldOut:
+        """Return the errors, on data left out, of columns `at` the fitted samples, shape (n, K), as of `sampled`."""
+        parts, each = self.grouped(at), FOLDS + 1
+        projected = [rows.project(own) for rows, own in zip(self.rows, parts, strict=True)]
+        products = [own.T @ own for own in parts]
+        whole, inner = _sum(projected), _sum(products)
+        held = [np.diag(_sum(products[k * each : (k + 1) * each])) > 0.0 for k in range(len(self.evidence.parts))]
+        place = self._places()
+        divisions = []
+        for groups, factor, record in self._left:
+            of_rest = whole - _sum([projected[group] for group in groups])
+            x = _solved(factor, of_rest)
+            rest = inner - _sum([products[group] for group in groups]) - of_rest.T @ x
+            missed = np.concatenate([parts[group] - self.rows[group].predict(x) for group in groups])
+            others = _sum([own.astype(int) for k, own in enumerate(held) if k != record]) if len(held) > 1 else np.ones(at.shape[1])
+            own = held[record] & (others == 0) if record >= 0 else np.zeros(at.shape[1], dtype=bool)
+            rest[own], rest[:, own] = 0.0, 0.0
+            fold = np.concatenate([np.full(parts[group].shape[0], group % each if record >= 0 else 0) for group in groups])
+            divisions.append(Division(np.asfortranarray(missed), rest, np.concatenate([place[group] for group in groups]), fold, own))
+        total = inner - whole.T @ _solved(self.factor, whole)
+        records = np.repeat(np.arange(len(held)), self._counts)
+        return HeldOut(divisions, total, records, len(held), self.problem.scale)
+
+    def _places(self) -> list[IntArray]:
+        """Return for each group where its rows are among the judged ones, in time order; -1: not judged."""
+        samples, each = self._samples, FOLDS + 1
+        judged = [self._judged_of(group, samples[slice(*ends)]) for group, ends in enumerate(pairwise(self._ends))]
+        whole = np.concatenate(judged)
+        order = np.argsort(samples[whole], kind="stable")
+        ranks = np.empty(order.size, dtype=np.int64)
+        ranks[order] = np.arange(order.size)
+        places = np.full(samples.size, -1)
+        places[whole] = ranks
+        self._counts = [int(sum(np.count_nonzero(judged[k * each + fold]) for fold in range(each))) for k in range(len(self.evidence.parts))]
+        return [places[slice(*ends)] for ends in pairwise(self._ends)]
+
+    def _judged_of(self, group: int, samples: IntArray) -> Mask:
+        record, fold = divmod(group, FOLDS + 1)
+        if fold == 0:
+            return np.zeros(samples.size, dtype=bool)
+        return np.ones(samples.size, dtype=bool) if record in self._judged_alone else self.predictable[samples]
 
     @cached_property
     def predictable(self) -> Mask:
@@ -153,12 +180,6 @@ class Joint:
             place = np.searchsorted(self._sample[rows], np.arange(samples.start, samples.stop), side="right") - 1
             found[samples] = predicted[np.maximum(place, 0)]
         return found
-
-    @cached_property
-    def blocks(self) -> list[IntArray]:
-        """Row indices of each held-out block, in time order."""
-        left_out = [self._groups[group] for fold in self.held_out[0] for group in fold.left]
-        return np.array_split(np.sort(np.concatenate(left_out)), BLOCKS)
 
     def padded(self, signal: FloatArray) -> FloatArray:
         """Return a signal, shape (N,), metres, at the rows of the problem, in units of its scale; 0 at others."""
@@ -183,53 +204,6 @@ class Joint:
         """Return signals, shape (N,) or (N, k) each, metres, as columns of a joint fit with the hysteresis."""
         return Columns(self, self.sampled(np.column_stack(signals)))
 
-    def score(self, signals: Sequence["Columns"], *, positive: int = 0, starting: Sequence[int] = ()) -> Score:
-        """Return the held-out errors of a joint fit of hysteresis and all other columns to the very first column."""
-        # The gains of the last `positive` columns are non-negative. The columns `starting` (the first not counted)
-        # describe the state before a record; with an offset, they are fitted to a held-out record itself.
-        at = self.grouped(np.column_stack([one.at for one in signals]))
-        projected = [np.column_stack(parts) for parts in zip(*(one.projected for one in signals), strict=True)]
-        products = [own.T @ own for own in at]
-        gains = _gains(_sum(projected), _sum(products), np.column_stack([one.solved for one in signals]), positive)
-        errors, (folds, records) = np.full(self.problem.y.size, np.nan), self.held_out
-        for k, fold in enumerate(folds):
-            solved = np.column_stack([one.solved_of_folds[k] for one in signals])
-            # Sums instead of differences, so that a column that is zero in all other groups stays exactly zero.
-            rest, inner = (_sum([own[group] for group in fold.rest]) for own in (projected, products))
-            of_rest = _gains(rest, inner, solved, positive)
-            x = solved @ _missed(of_rest)
-            for group in fold.left:
-                errors[self._groups[group]] = self.rows[group].predict(x) - at[group] @ _missed(of_rest)
-        losses = np.array([float(np.mean(errors[rows] ** 2)) for rows in self.blocks])
-        left_out = []
-        for record in records:
-            # The gains are fitted to all records, because the remaining ones, if at one speed, may not determine them.
-            rest = _sum([projected[group] for group in record.rest])
-            x = _solved(record.factor, rest @ _missed(gains))
-            missed = [self.rows[group].predict(x) - at[group] @ _missed(gains) for group in record.left]
-            began = [at[group][:, 1:][:, starting] for group in record.left]
-            left_out.append(_without_start(np.concatenate(missed)[record.judged], np.concatenate(began)[record.judged]))
-        square = self.problem.scale**2
-        return Score(losses * square, gains, np.array(left_out) * square)
-
-
-def _without_start(missed: FloatArray, began: FloatArray) -> float:
-    """Return the mean square of errors (n,) after a fit of a constant and of columns (n, k); NaN if too few."""
-    if missed.size < FEWEST_JUDGED:
-        return np.nan
-    own = np.column_stack([np.ones(missed.size), began[:, began.any(axis=0)]])
-    return float(np.mean((missed - own @ np.linalg.lstsq(own, missed, rcond=None)[0]) ** 2))
-
-
-@dataclass(frozen=True)
-class _HeldOut:
-    """Held-out groups, the other groups, the Cholesky factor of these, and the mask of the rows they can predict."""
-
-    left: Sequence[int]
-    rest: Sequence[int]
-    factor: Factor
-    judged: Mask
-
 
 @dataclass(frozen=True)
 class Columns:
@@ -237,12 +211,6 @@ class Columns:
 
     joint: Joint
     at: FloatArray
-
-    @cached_property
-    def projected(self) -> list[FloatArray]:
-        """Product ``A'J`` of each group, shape (p, k)."""
-        joint = self.joint
-        return [rows.project(own) for rows, own in zip(joint.rows, joint.grouped(self.at), strict=True)]
 
     @cached_property
     def whole(self) -> FloatArray:
@@ -253,14 +221,6 @@ class Columns:
     def solved(self) -> FloatArray:
         """Hysteresis parameters, shape (p, k), of the best fit to each column."""
         return _solved(self.joint.factor, self.whole)
-
-    @cached_property
-    def solved_of_folds(self) -> list[FloatArray]:
-        """Hysteresis parameters, shape (p, k), of the best fit to each column without the samples of each fold."""
-        return [
-            _solved(fold.factor, _sum([self.projected[group] for group in fold.rest]))
-            for fold in self.joint.held_out[0]
-        ]
 
     @cached_property
     def _products(self) -> FloatArray:
@@ -288,25 +248,12 @@ def _missed(gains: FloatArray) -> FloatArray:
     return np.concatenate([[1.0], -gains])
 
 
-def _gains(projected: FloatArray, products: FloatArray, solved: FloatArray, positive: int = 0) -> FloatArray:
+def _gains(projected: FloatArray, products: FloatArray, parameters: FloatArray) -> FloatArray:
     """Return the gains, shape (k,), of the columns in a joint fit with the hysteresis to the first column."""
-    # `projected` is ``A'J``, `solved` the hysteresis parameters of the best fit to each column, shape (p, 1 + k) each,
-    # and `products` is ``J'J``, shape (1 + k, 1 + k). The gains of the last `positive` columns are non-negative.
-    if products.shape[0] == 1:
-        return np.empty(0)
-    left = products[1:] - projected[:, 1:].T @ solved
-    size = np.sqrt(np.maximum(np.diag(products)[1:], 1e-300))
-    matrix, vector = left[:, 1:] / np.outer(size, size) + ALIKE * np.eye(size.size), left[:, 0] / size
-    gains: FloatArray
-    if not positive:
-        gains = scipy.linalg.solve(matrix, vector, assume_a="pos")
-    else:
-        # The minimum of g' M g / 2 - b' g with M = R' R is that of |R g - R^-T b|.
-        root = scipy.linalg.cholesky(matrix)
-        wanted = scipy.linalg.solve_triangular(root, vector, trans="T")
-        lower = np.repeat([-np.inf, 0.0], [size.size - positive, positive])
-        gains = lsq_linear(root, wanted, (lower, np.full(size.size, np.inf))).x
-    return gains / size
+    # `projected` is ``A'J``, `parameters` of the hysteresis are those of the best fit to each column, shape (p, 1 + k)
+    # each, and `products` is ``J'J``, shape (1 + k, 1 + k).
+    left = products[1:] - projected[:, 1:].T @ parameters
+    return solved(left[:, 1:], left[:, 0])
 
 
 def _solved(factor: Factor, of: FloatArray) -> FloatArray:
@@ -405,10 +352,9 @@ class Explanation:
         else:
             self.joint = Joint(evidence, self.u, like.joint if like else None)
         starting = [one.starting(evidence.around, evidence.used, older=evidence.older_moves) for one in self.effects]
-        self._ends = np.cumsum([0, *(columns.shape[1] for columns in starting)]).tolist()
-        self._before = np.column_stack([*starting, evidence.beside])
-        self._starting = range(self._ends[-1])
-        beside = self.joint.columns(self._before)
+        self.starts = np.cumsum([0, *(columns.shape[1] for columns in starting)]).tolist()
+        self.before = np.column_stack([*starting, evidence.beside])
+        beside = self.joint.columns(self.before)
         behind = any(effect.acts_on == "displacement" for effect in self.effects)
         self.added = self._aside
         if not behind or not like:
@@ -427,10 +373,10 @@ class Explanation:
     def _fit(self, beside: Columns) -> None:
         self._x, gains = beside.fit(self.target)
         self.h = self.joint.predict(self._x)
-        self.settling = self._before @ gains
+        self.settling = self.before @ gains
         self.began = {
             effect.name: gains[first:end]
-            for effect, (first, end) in zip(self.effects, pairwise(self._ends), strict=True)
+            for effect, (first, end) in zip(self.effects, pairwise(self.starts), strict=True)
         }
 
     @property
@@ -502,29 +448,11 @@ class Explanation:
         """Return the prediction, shape (N,), metres, without one of the effects and with everything else unchanged."""
         return self._whole([effect for effect in self.effects if effect.name != name])
 
-    def score(self, candidate: Candidate) -> Score:
-        """Return the held-out errors with a candidate added and all effects refitted to first order."""
-        first = self._before.shape[1] + self.tangents.shape[1]
-        starting = [*self._starting_columns, *range(first, first + candidate.starting)]
-        signals = self._signals, self.joint.columns(candidate.columns)
-        return self.joint.score(signals, positive=candidate.positive, starting=starting)
-
     @cached_property
-    def _signals(self) -> Columns:
-        """Columns of the joint fit: target, initial relaxation, additional columns, and tangents of the effects."""
-        return self.joint.columns(self.target, self._before, self.tangents)
-
-    @cached_property
-    def held_out(self) -> Score:
+    def held_out(self) -> Loss:
         """Held-out errors of this fit."""
-        return self.joint.score([self._signals], starting=self._starting_columns)
-
-    @property
-    def _starting_columns(self) -> list[int]:
-        """Indices of the columns that describe the state before a record: relaxations, and starts of the effects."""
-        own = [is_start for effect in self.effects for is_start in of_starts(effect)]
-        first = self._before.shape[1]
-        return [*self._starting, *(first + k for k, is_start in enumerate(own) if is_start)]
+        columns = np.column_stack([self.target, self.before, self.tangents])
+        return self.joint.held_out(self.joint.sampled(columns)).loss([0], range(1, columns.shape[1]))
 
     @property
     def objective(self) -> float:
@@ -546,7 +474,7 @@ class Explanation:
 
     def _step(self) -> "Explanation":
         """Return the fit after one Gauss-Newton step, shortened until the objective falls; else the fit itself."""
-        change = self.joint.columns(self._before, self.tangents).fit(self.target)[1][self._before.shape[1] :]
+        change = self.joint.columns(self.before, self.tangents).fit(self.target)[1][self.before.shape[1] :]
         for share in SHARES:
             try:
                 effects = self._stepped(share * change)
@@ -623,7 +551,7 @@ class Explanation:
     def _deviations(self, columns: FloatArray) -> FloatArray:
         """Return the standard deviations, shape (k,), of the gains of columns, shape (N, k), metres."""
         # Errors of neighbouring samples are correlated, so there are fewer independent errors than samples.
-        precision = self.joint.columns(columns, self._before).precision
+        precision = self.joint.columns(columns, self.before).precision
         errors = self.residual[self.evidence.used]
         size = np.sqrt(np.maximum(np.diag(precision), 1e-300))
         inverse = np.linalg.pinv(precision / np.outer(size, size), rcond=1e-12) / np.outer(size, size)
@@ -639,7 +567,7 @@ class Explanation:
             return self
         smoothed = Explanation(replace(self.evidence, smoothness=best), self.effects).refined(2)
         # That choice is based on one division into blocks and on fixed effects; therefore compare after a refit.
-        return min(self.refined(2), smoothed, key=lambda one: one.held_out.rms_of_records)
+        return min(self.refined(2), smoothed, key=lambda one: one.held_out.rms)
 
     @cached_property
     def zeros(self) -> FloatArray:
@@ -669,10 +597,17 @@ class Explanation:
         """Return the fit with an effect in place of another one."""
         return Explanation(self.evidence, [effect if one.name == name else one for one in self.effects], self)
 
-    def only(self, names: Collection[str]) -> "Explanation":
-        """Return the fit with only the named effects, refitted if any effect is removed."""
+    def predicted_with(self, effect: Effect) -> FloatArray:
+        """Return the prediction, shape (N,), metres, with one more effect and with everything else unchanged."""
+        return self._whole(in_order([*(one for one in self.effects if one.name != effect.name), effect]))
+
+    def only(self, names: Collection[str], *, refine: bool = True) -> "Explanation":
+        """Return the fit with only the named effects, refitted (default) if any effect is removed."""
         kept = [effect for effect in self.effects if effect.name in names]
-        return self if len(kept) == len(self.effects) else Explanation(self.evidence, kept, self).refined(2)
+        if len(kept) == len(self.effects):
+            return self
+        fit = Explanation(self.evidence, kept, self)
+        return fit.refined(2) if refine else fit
 
     def without(self, name: str) -> "Explanation":
         """Return the fit without one effect, with the others refitted."""
@@ -720,15 +655,3 @@ class RecordResidual:
 def _behind(effects: Sequence[Effect], h: FloatArray, around: EffectContext) -> FloatArray:
     """Return the displacement, shape (N,), metres, after effects have been applied to the hysteresis output `h`."""
     return forward([effect for effect in effects if effect.acts_on == "displacement"], h, around)
-
-
-def alike_in_a_row(errors: FloatArray) -> float:
-    """Return the number of samples per independent error, from the autocorrelation up to its first zero."""
-    errors = errors - errors.mean()
-    power = np.abs(np.fft.rfft(errors, 2 * errors.size)) ** 2
-    correlation = np.fft.irfft(power)[: errors.size]
-    if not correlation[0] > 0.0:
-        return 1.0
-    correlation = correlation / correlation[0]
-    positive = int(np.argmax(correlation <= 0.0)) or correlation.size
-    return float(max(1.0, 2.0 * correlation[:positive].sum() - 1.0))

@@ -7,13 +7,11 @@ from typing import Any
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.diagnosis.candidates import held_out_error
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.fingerprint import Left, Signals, fingerprint, half_power, hint
-from slpi_ros.diagnosis.joint_fit import Explanation, Score
+from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import MOST_SAMPLES, Evidence, one_speed
-from slpi_ros.diagnosis.selection import Named, Selection
-from slpi_ros.diagnosis.significance import chance_of_gain
+from slpi_ros.diagnosis.search import Answer, Named
 from slpi_ros.diagnosis.structures import BIAS, LEVEL, NOT_CLOSING
 from slpi_ros.effects.base import Effect, usual_step
 from slpi_ros.effects.excitation import FASTEST
@@ -206,7 +204,7 @@ class Given:
 
 
 def judged(
-    selection: Selection,
+    answer: Answer,
     signals: Sequence[Signals],
     noise_rms: float,
     repeatability: Repeatability,
@@ -220,16 +218,16 @@ def judged(
     `signals` hold what is left, of which the fingerprint is taken.
     """
     # `driven_alike` are other axes with the same drive as this one.
-    base, now = selection.base, selection.now
-    effects = _named_effects(selection)
-    verdict = _verdict(selection, effects, noise_rms)
+    base, now = answer.base, answer.now
+    effects = _named_effects(answer)
+    verdict = _verdict(answer, effects, noise_rms)
     left = fingerprint(signals)
     return AxisDiagnosis(
         verdict=verdict,
-        summary=_of_given(given, selection, before_rms)
-        + _summary(verdict, selection, effects, noise_rms, before_rms)
+        summary=_of_given(given, answer, before_rms)
+        + _summary(verdict, answer, effects, noise_rms, before_rms)
         + _goes_with(left, verdict, signals)
-        + _in_model(now, effects, selection.dropped)
+        + _in_model(now, effects, answer.dropped)
         + _mixed(now.evidence)
         + _cannot_tell(driven_alike)
         + _looked_at(now.evidence, effects),
@@ -238,58 +236,55 @@ def judged(
         repeatability_source=repeatability.source,
         given_rms=given.rms,
         before_rms=before_rms,
-        after_rms=now.held_out.rms_of_records,
+        after_rms=now.held_out.rms,
         effects=effects,
-        next_experiment=_next(verdict, selection, effects, left, stale=_stale(given, selection)),
+        next_experiment=_next(verdict, answer, effects, left, stale=_stale(given, answer)),
         traces=_traces(base, now),
         left=left,
         records=records,
         surroundings=tuple(now.evidence.surroundings),
-        dropped=selection.dropped,
+        dropped=answer.dropped,
         given=given,
     )
 
 
-def _named_effects(selection: Selection) -> tuple[NamedEffect, ...]:
-    courses = selection.now.evidence.courses
-    fitted = {effect.name: effect.with_filters(courses) for effect in selection.now.with_uncertainty()}
-    return tuple(_named_effect(fitted[named.name], named, selection) for named in selection.named)
+def _named_effects(answer: Answer) -> tuple[NamedEffect, ...]:
+    courses = answer.now.evidence.courses
+    fitted = {effect.name: effect.with_filters(courses) for effect in answer.now.with_uncertainty()}
+    return tuple(_named_effect(fitted[named.name], named, answer) for named in answer.named)
 
 
-def _named_effect(effect: Effect, named: Named, selection: Selection) -> NamedEffect:
-    chance = chance_of_gain(named.without, selection.now.held_out, selection.trials)
-    whole, before, after = (
-        held_out_error(score, own=named.own) for score in (selection.base.held_out, named.before, named.after)
-    )
+def _named_effect(effect: Effect, named: Named, answer: Answer) -> NamedEffect:
+    before, after = named.before.square, named.after.square
     return NamedEffect(
         effect=effect.parts[0] if isinstance(effect, EachRecord) else effect,
-        gain_percent=100.0 * (1.0 - after / before),
-        share_of_residual=float(np.clip((before**2 - after**2) / whole**2, 0.0, 1.0)),
-        p_value=chance,
+        gain_percent=100.0 * (1.0 - (after / before) ** 0.5),
+        share_of_residual=float(np.clip((before - after) / answer.base.held_out.square, 0.0, 1.0)),
+        p_value=named.p_value,
         alternatives=named.alternatives,
-        evidence=_evidence(effect, named, chance, selection.now.held_out),
+        evidence=_evidence(effect, named, answer),
     )
 
 
-def _evidence(effect: Effect, named: Named, chance: float, in_the_end: Score) -> str:
+def _evidence(effect: Effect, named: Named, answer: Answer) -> str:
     before, after, without, end = (
-        length(held_out_error(score, own=named.own)) for score in (named.before, named.after, named.without, in_the_end)
+        length(loss.rms) for loss in (named.before, named.after, named.without, answer.now.held_out)
     )
-    on = "other records" if named.after.records.size and not named.own else "other parts of the record"
+    on = "records left out" if len(answer.now.evidence.parts) > 1 else "parts left out"
     gained = (
-        f"{effect.describe()}; held-out error, on {on}: {before} before, {after} rms with it; all effects found "
-        f"{end}, the same without this one {without} (p = {chance:.2g} that chance gains as much)"
+        f"{effect.describe()}; held-out error, on the {on}: {before} before, {after} rms with it; all effects found "
+        f"{end}, the same without this one {without} (p = {named.p_value:.2g} that chance gains as much)"
     )
     if not named.runner_up:
-        return f"{gained}; no other effect lowers it as much"
+        return gained
     other, rms = named.runner_up
     return f"{gained}; with {other} instead {length(rms)}"
 
 
-def _verdict(selection: Selection, effects: tuple[NamedEffect, ...], noise_rms: float) -> str:
-    more_than_noise = selection.now.held_out.rms_of_records > ABOVE_NOISE * noise_rms
+def _verdict(answer: Answer, effects: tuple[NamedEffect, ...], noise_rms: float) -> str:
+    more_than_noise = answer.now.held_out.rms > ABOVE_NOISE * noise_rms
     if not effects:
-        return UNEXPLAINED if more_than_noise or BIAS in selection.structures else NOTHING_FOUND
+        return UNEXPLAINED if more_than_noise or BIAS in answer.structures else NOTHING_FOUND
     if any(named.alternatives for named in effects):
         return AMBIGUOUS
     return PARTLY_NAMED if more_than_noise else NAMED
@@ -317,17 +312,17 @@ def _goes_with(left: Sequence[Left], verdict: str, records: Sequence[Signals]) -
     )
 
 
-def _stale(given: Given, selection: Selection) -> bool:
+def _stale(given: Given, answer: Answer) -> bool:
     """Return whether the given model is out of date, so that a refit of the same kind corrects it."""
-    return BIAS not in selection.structures and given.changed
+    return BIAS not in answer.structures and given.changed
 
 
-def _of_given(given: Given, selection: Selection, before_rms: float) -> str:
+def _of_given(given: Given, answer: Answer, before_rms: float) -> str:
     error, anew = length(given.rms), length(before_rms)
     moved = ""
     if given.zero_moved is not None:
         moved = f"The zero has moved by {length(given.zero_moved)}. "
-    if _stale(given, selection):
+    if _stale(given, answer):
         return (
             f"The given model is off by {error} rms, one fitted to the record by {anew}: the stage has "
             f"changed since, its gain by {100 * given.gain:+.2g} %. {moved}"
@@ -335,7 +330,7 @@ def _of_given(given: Given, selection: Selection, before_rms: float) -> str:
     if moved:
         same = 100.0 * max(abs(given.gain), given.hysteresis_rms / given.motion)
         return f"{moved}The loops are the same within {same:.1g} %. "
-    return f"The given model is off by {error} rms on this record. " if BIAS in selection.structures else ""
+    return f"The given model is off by {error} rms on this record. " if BIAS in answer.structures else ""
 
 
 def _in_model(now: Explanation, effects: Sequence[NamedEffect], dropped: Sequence[str]) -> str:
@@ -360,9 +355,9 @@ def _mixed(evidence: Evidence) -> str:
 
 
 def _summary(
-    verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], noise_rms: float, before_rms: float
+    verdict: str, answer: Answer, effects: tuple[NamedEffect, ...], noise_rms: float, before_rms: float
 ) -> str:
-    after = selection.now.held_out.rms_of_records
+    after = answer.now.held_out.rms
     left = f"the remaining error is {length(after)} rms, the sensor noise {length(noise_rms)}"
     found = ", then ".join(
         f"{named.name}, which reduces {'the remaining error' if place else 'the error'} by {named.gain_percent:.0f} %"
@@ -370,9 +365,9 @@ def _summary(
     )
     if verdict == NOTHING_FOUND:
         return f"No effect found: {left}."
-    structure = f"The hysteresis itself is wrong: {', '.join(selection.structures)}. " if selection.structures else ""
+    structure = f"The hysteresis itself is wrong: {', '.join(answer.structures)}. " if answer.structures else ""
     if verdict == UNEXPLAINED:
-        if BIAS in selection.structures:
+        if BIAS in answer.structures:
             return f"{structure}None of the known effects is needed: with loops that depend on bias {left}."
         return f"{structure}None of the known effects explains the error: {left}."
     others = ""
@@ -400,24 +395,24 @@ def _looked_at(evidence: Evidence, effects: Sequence[NamedEffect]) -> str:
 
 
 def _next(
-    verdict: str, selection: Selection, effects: tuple[NamedEffect, ...], left: Sequence[Left], *, stale: bool
+    verdict: str, answer: Answer, effects: tuple[NamedEffect, ...], left: Sequence[Left], *, stale: bool
 ) -> str | None:
     steps = [UP_TO_DATE] if stale else []
     steps += (
         []
         if verdict == NOTHING_FOUND
         else [
-            ANOTHER_HYSTERESIS[structure].format(command=_command(selection.now.evidence))
-            for structure in selection.structures
+            ANOTHER_HYSTERESIS[structure].format(command=_command(answer.now.evidence))
+            for structure in answer.structures
         ]
     )
     if verdict == AMBIGUOUS:
         first = next((named for named in effects if named.alternatives), effects[0])
-        steps.append(_separating((first.name, *first.alternatives), selection.now.evidence))
+        steps.append(_separating((first.name, *first.alternatives), answer.now.evidence))
     if verdict == PARTLY_NAMED and left:
         steps.append(f"For the remaining error, {hint(left[0].variable)}.")
     elif verdict in (UNEXPLAINED, PARTLY_NAMED) and not steps:
-        steps.append(_more_loops(selection.now.evidence))
+        steps.append(_more_loops(answer.now.evidence))
     return " ".join(steps) or None
 
 

@@ -1,0 +1,91 @@
+"""The criterion of a diagnosis: which of two joint fits predicts better what was not fitted."""
+
+from collections.abc import Sequence
+from functools import cache
+
+import numpy as np
+from scipy.special import stdtr
+
+from slpi_ros.arrays import FloatArray
+from slpi_ros.diagnosis.held_out import Loss, in_blocks
+
+# Largest probability that chance makes any of all sets that were tried better.
+CHANCE = 0.001
+# A contribution below this share of the sensor's noise is not told.
+LEAST = 0.1
+# Largest ratio of the errors on a record left out with a set that is better, and without.
+NO_WORSE = 1.05
+# Random signs of the blocks, and the share of them by which the number of independent sets is estimated.
+SURROGATES, TAIL, SIGNED_BLOCKS = 1999, 0.05, 40
+# Smallest p-value.
+LEAST_CHANCE = 1e-12
+
+
+def beats(one: Loss, other: Loss, noise: float, trials: float = 1.0) -> bool:
+    """Return whether a joint fit predicts better than another one, by more than chance and a tenth of the noise (m)."""
+    fall = other.square - one.square
+    return fall > (LEAST * noise) ** 2 and carries_over(one, other) and chance(one, other, trials) <= CHANCE
+
+
+def carries_over(one: Loss, other: Loss) -> bool:
+    """Return whether a joint fit is worse than the other one on no record that is left out."""
+    both = np.isfinite(one.records) & np.isfinite(other.records)
+    return bool(np.all(one.records[both] <= NO_WORSE**2 * other.records[both]))
+
+
+def chance(one: Loss, other: Loss, trials: float = 1.0) -> float:
+    """Return the probability that a fit that is no better looks so much better, as the best of `trials` ones.
+
+    With the difference ``d`` of the predictions, the squares differ by ``d^2 + 2 d e``, where ``e`` are the errors of
+    the better one: chance is in the products ``d e`` alone.
+    """
+    d = other.errors - one.errors
+    products, fall = in_blocks(d * one.errors), float(np.sum(other.errors**2 - one.errors**2))
+    row = _in_a_row(products)
+    deviation = 2.0 * float(np.sqrt(np.sum(products**2) * row))
+    if not deviation > 0.0:
+        return LEAST_CHANCE if fall > 0.0 else 1.0
+    alone = float(stdtr(max(products.size / row - 1.0, 1.0), -fall / deviation))
+    return float(max(-np.expm1(trials * np.log1p(-min(alone, 1.0 - 1e-12))), LEAST_CHANCE))
+
+
+def independent_trials(before: Loss, tried: Sequence[Loss]) -> float:
+    """Return the number of independent sets whose best gain is by chance as large as that of those `tried`.
+
+    From the maximum over all sets for random signs of the blocks: Westfall and Young, Resampling-Based Multiple
+    Testing, Wiley 1993, Sec. 2.6.
+    """
+    if not tried:
+        return 1.0
+    parts = np.array_split(np.arange(before.blocks.size), min(SIGNED_BLOCKS, before.blocks.size))
+    gains = np.array([[float(np.sum((before.blocks - after.blocks)[own])) for own in parts] for after in tried])
+    largest, count = np.abs(gains).max(axis=1), len(parts)
+    usable = (largest > 0.0) & np.isfinite(largest)
+    gains = gains[usable] / largest[usable, None]
+    directions = gains / np.linalg.norm(gains, axis=1, keepdims=True)
+    shares = (_signs(count) @ directions.T).max(axis=1, initial=0.0)
+    # The sum of gains with random signs, relative to the root of the sum of their squares, as Student's t.
+    share = float(np.clip(np.quantile(shares, 1.0 - TAIL), 0.0, np.sqrt(count) * 0.99))
+    alone = float(stdtr(count - 1, -share * np.sqrt((count - 1) / (count - share**2))))
+    return float(max(1.0, np.log1p(-TAIL) / np.log1p(-alone)))
+
+
+@cache
+def _signs(blocks: int) -> FloatArray:
+    """Return random sign patterns, shape (surrogates, blocks), the same ones at every call."""
+    return np.random.default_rng(0).choice([-1.0, 1.0], (SURROGATES, blocks))
+
+
+def alike_in_a_row(errors: FloatArray) -> float:
+    """Return the number of samples per independent error, from the autocorrelation up to its first zero."""
+    return _in_a_row(errors - errors.mean())
+
+
+def _in_a_row(values: FloatArray) -> float:
+    power = np.abs(np.fft.rfft(values, 2 * values.size)) ** 2
+    correlation = np.fft.irfft(power)[: values.size]
+    if not correlation[0] > 0.0:
+        return 1.0
+    correlation = correlation / correlation[0]
+    positive = int(np.argmax(correlation <= 0.0)) or correlation.size
+    return float(max(1.0, 2.0 * correlation[:positive].sum() - 1.0))

@@ -1,6 +1,6 @@
 """Registry of the effects by name, and their conversion to and from documents."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from importlib import import_module
 from math import isinf
@@ -25,6 +25,7 @@ MODULES = (
     "gain_drift",
     "cross_coupling",
     "thermal_drift",
+    "clock",
     "steps",
     "sensor_periodic",
     "hum",
@@ -54,7 +55,7 @@ def to_document(effect: Effect) -> dict[str, Any]:
     """Return an effect as a JSON document in SI units."""
     return {
         "name": effect.name,
-        "parameters": {name: _plain(getattr(effect, name)) for name in facts_of(type(effect))},
+        "parameters": {name: _plain(value) for name, value in _given(effect)},
         "uncertainty": dict(effect.uncertainty),
     }
 
@@ -72,6 +73,15 @@ def from_document(document: Any) -> Effect:
     }
     effect: Effect = EFFECTS[name](**read)
     return effect
+
+
+def _given(effect: Effect) -> Iterator[tuple[str, Any]]:
+    """Yield the parameters by name, but empty lists and numbers that count where such a list is not empty."""
+    every = {name: getattr(effect, name) for name in facts_of(type(effect))}
+    for name, value in every.items():
+        absent = facts_of(type(effect))[name].instead
+        if value != () and not (absent and every[absent]):
+            yield name, value
 
 
 def _plain(value: Any) -> Any:

@@ -76,11 +76,10 @@ def from_document(document: Any) -> Effect:
 
 
 def _given(effect: Effect) -> Iterator[tuple[str, Any]]:
-    """Yield the parameters by name, but empty lists and numbers that count where such a list is not empty."""
-    every = {name: getattr(effect, name) for name in facts_of(type(effect))}
-    for name, value in every.items():
-        absent = facts_of(type(effect))[name].instead
-        if value != () and not (absent and every[absent]):
+    """Yield the parameters by name, but optional lists that are empty and what counts only instead of one."""
+    for name, facts in facts_of(type(effect)).items():
+        value = getattr(effect, name)
+        if (facts.required or value != ()) and not (facts.instead and getattr(effect, facts.instead)):
             yield name, value
 
 

@@ -200,7 +200,8 @@ def _of(source, name: str):
 
 
 def _after_a_step(source, times):
-    taus, gains = np.array(_of(source, "time_constants")), np.array(_of(source, "gains"))
+    given = isinstance(source, Mapping)
+    taus, gains = (np.array(source[name]) for name in ("time_constants", "gains")) if given else source.chain
     return -np.exp(-times[:, None] / taus) @ gains
 
 

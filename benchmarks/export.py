@@ -101,7 +101,9 @@ DRAWS = {
         (rng.uniform(0.1, 1), rng.uniform(1, 100)), (rng.uniform(0, 0.03), rng.uniform(0, 0.03))
     ),
     "contact": lambda rng: Contact(rng.uniform(2e-6, 9e-6), rng.uniform(0.3, 1.5)),
-    "resonance": lambda rng: Resonance((Mode(rng.uniform(80, 600), rng.uniform(0.01, 0.1), rng.uniform(0.2, 1.0)),)),
+    "resonance": lambda rng: Resonance(
+        (Mode(rng.uniform(80, 600), 10 ** rng.uniform(-2, 0.3), rng.uniform(0.2, 1.0)),)
+    ),
     "self_heating": lambda rng: SelfHeating(10 ** rng.uniform(-10, -8), rng.uniform(1, 100), 1e-6),
     "surroundings": lambda rng: Surroundings(
         (

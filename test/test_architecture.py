@@ -208,6 +208,7 @@ NAMED_ELSEWHERE = {
     "nodes/compensator_parameters.py": ({"surroundings"}, "the same"),
     "export/stage.py": ({"surroundings"}, "its quantities come into the exported source by a call of their own"),
     "nodes/identify.py": ({"surroundings"}, "the parameter, which names topics"),
+    "cli/options.py": ({"clock"}, "an option of that name: which of two topics has the times of the samples"),
 }
 
 

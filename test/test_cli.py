@@ -294,12 +294,10 @@ def wrong_version(folder, tmp_path):
     return ("show", tmp_path / "new.json"), 1, "slpi_ros/model/999"
 
 
-def retired_effect(folder, tmp_path):
+def retired_version(folder, tmp_path):
     document = json.loads((folder / "pi.json").read_text()) | {"schema": "slpi_ros/model/1"}
-    parameters = {"widening": 0.1, "backlash": 0.0, "exponent": 0.1, "reference_rate": 1.0, "transition": 1.0}
-    document["axes"]["x"]["effects"] = [{"name": "rate_dependence", "parameters": parameters}]
     (tmp_path / "old.json").write_text(json.dumps(document))
-    return ("show", tmp_path / "old.json"), 1, "diagnose again from its bags"
+    return ("show", tmp_path / "old.json"), 1, "identify the stage again from its bags"
 
 
 def binary_model(folder, tmp_path):
@@ -420,7 +418,7 @@ def nothing(folder, tmp_path):
 
 
 CASES = (
-    truncated, wrong_version, retired_effect, binary_model, no_model, another_axis, far_command, nan_command,
+    truncated, wrong_version, retired_version, binary_model, no_model, another_axis, far_command, nan_command,
     backwards_command, no_bag,
     truncated_bag, wrong_topic, wrong_axis, empty_window, constant_voltage, no_such_column, existing_bag,
     unknown_unit, contradicted_unit, column_in_two_roles, compensate_over_its_table, compensate_over_its_model,

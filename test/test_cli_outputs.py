@@ -84,7 +84,7 @@ def test_a_file_that_slpi_did_not_write_stays(slpi, inputs, tmp_path, command):
     assert code == 0 and any(name in line and "replaced" in line for line in lines)
     # Its own output is replaced without a word, of an earlier version or through a link as well.
     own = (tmp_path / name).read_text()
-    (tmp_path / name).write_text(own.replace("slpi_ros/model/2", "slpi_ros/model/1"))
+    (tmp_path / name).write_text(own.replace("slpi_ros/model/3", "slpi_ros/model/2"))
     (tmp_path / "link").symlink_to(name)
     for place in (name, "link"):
         assert own != text and slpi(*arguments, "-o", place) == (0, [])

@@ -75,7 +75,7 @@ def test_setup_py_and_the_ways_to_get_packages_name_the_same_ones():
     ],
 )
 def test_the_command_line_names_it_in_one_line(record, tmp_path, name, arguments, contents):
-    (record / "wrong.json").write_text('{"schema": "slpi_ros/model/1"}')
+    (record / "wrong.json").write_text('{"schema": "slpi_ros/model/2"}')
     words = [str(record / word) if (record / word).exists() and word != "." else word for word in arguments.split()]
     done = run(tmp_path, name, contents, "-m", "slpi_ros.cli", *words)
     assert done.returncode == 1

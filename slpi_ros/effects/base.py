@@ -239,6 +239,8 @@ class EffectBase(Protocol):
     side: ClassVar[Side]
     # Whether only feedback undoes it, because it follows time and not the voltage, or comes before the voltage.
     needs_feedback: ClassVar[bool] = False
+    # Whether the inverse of a whole path is better than that sample by sample, as it looks ahead.
+    looks_ahead: ClassVar[bool] = False
     # Whether it acts on the displacement, and depends on the voltage at the piezo, too.
     needs_voltage: ClassVar[bool] = False
     sharing: ClassVar[Sharing] = "shared"
@@ -266,11 +268,6 @@ class EffectBase(Protocol):
     def companion(cls) -> "Effect | None":
         """Return the effect against which it trades, and with which it is fitted therefore, as it is at first."""
         return None
-
-    @classmethod
-    def from_version_1(cls, given: dict[str, Any], spread: Any) -> tuple[dict[str, Any], Any]:
-        """Return parameters and uncertainty of a document of version 1 as in the present one; ModelError if retired."""
-        return given, spread
 
     def plausible(self, context: "FitContext") -> bool:
         """Return whether the parameters are plausible, so that the effect does not imitate another cause."""

@@ -2,8 +2,8 @@
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial
-from math import inf, log
+from functools import cached_property, partial
+from math import gamma, inf, isinf, log
 from typing import Any, ClassVar
 
 import numpy as np
@@ -38,6 +38,11 @@ SINGLE, SEVERAL, LEAST_SHARE = 7, ((2, 0.1), (2, 0.5), (3, 0.3), (4, 0.7)), 0.02
 # Logarithmic law, equal gains: relaxations per decade, from the longer of `FASTEST` and a number of samples, to a share
 # of the longest record, and the smallest number of relaxations.
 LAW_PER_DECADE, LAW_SAMPLES, LAW_TO, LAW_FEWEST = 2, 3.0, (0.3, 3.0), 4
+# Power of time: time constants (s) of its chain, and the ratio of the edges between them to them; exponents of the
+# candidates; bounds of the exponent, which near 1 is a drift with the displacement; time (s) from which on it is
+# unsure, as few records are longer.
+CHAIN, EDGE, POWERS = 10.0 ** np.arange(-3.0, 5.1, 0.5), 10.0**0.25, (0.1, 0.3, 0.6)
+LEAST_POWER, MOST_POWER, UNSURE_FROM = 0.02, 0.9, 100.0
 # Relaxations with a time constant below this share of the record may have an identifiable state at its start.
 SOON_SETTLED = 0.025
 # Creep from a move before the records is known if all records agree on the move within this share.
@@ -53,7 +58,10 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 @dataclass(frozen=True)
 class Creep(EffectBase):
-    """Parallel relaxations, ``y = h + sum_k g_k z_k``, ``tau_k dz_k/dt = (h - h_0) - z_k``, at first in equilibrium."""
+    """Parallel relaxations, ``y = h + sum_k g_k z_k``, ``tau_k dz_k/dt = (h - h_0) - z_k``, at first in equilibrium.
+
+    They are given each by itself, or by a power of time: a step creeps on by the share ``gain (t / 1 s)^exponent``.
+    """
 
     # ``h_0``, the `origin`, is where creep adds nothing; in a fit, where there is none, the first one of each record.
     name: ClassVar[str] = "creep"
@@ -73,31 +81,55 @@ class Creep(EffectBase):
     )
 
     time_constants: tuple[float, ...] = parameter(
-        "s", "time constants tau_k", 0, 1e7, above=True, count=(1, 100),
+        "s", "time constants tau_k", 0, 1e7, above=True, default=(), count=(0, 100),
         fit=Fit("relative", least=FASTEST, within_record=True),
     )  # fmt: skip
     gains: tuple[float, ...] = parameter(
-        "", "shares g_k of the motion that follow with each", -0.9, 11, count=(1, 100), fit=Fit("linear", 1e-5, 0.0)
-    )
+        "", "shares g_k of the motion that follow with each", -0.9, 11, default=(), count=(0, 100),
+        fit=Fit("linear", 1e-5, 0.0),
+    )  # fmt: skip
     origin: float = parameter(
         "m", "displacement h_0 to which creep adds nothing; null: that at the start", -1e3, 1e3, default=inf, none=True
     )
     # Only `apply` includes the creep after it; streaming starts at equilibrium.
     initial: float = parameter("m", "step of the displacement just before the record", -1e3, 1e3, default=0.0)
+    exponent: float = parameter(
+        "", "exponent of a power of time, instead of time constants; null: none", 0, 1, above=True, below=True,
+        default=inf, none=True, instead="time_constants", fit=Fit("relative", least=LEAST_POWER, most=MOST_POWER),
+    )  # fmt: skip
+    gain: float = parameter(
+        "", "share of a step that has followed after 1 s by the power of time", 0, 1, default=0.0, instead="gains",
+        fit=Fit("linear", 1e-5, 0.0, LARGEST_SOON, absent=True),
+    )  # fmt: skip
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        given = bool(self.time_constants) == isinf(self.exponent)
         require(
             self,
+            ("exponent", given, "given if there are no time constants, and else left out"),
             ("gains", len(self.gains) == len(self.time_constants), "one for each time constant"),
             ("gains", sum(min(g, 0.0) for g in self.gains) > -0.9, "more than -0.9 in sum where they are negative"),
             ("gains", sum(self.gains) <= 10, "at most 10 in sum"),
         )
 
+    @cached_property
+    def chain(self) -> FloatArray:
+        """Time constants (s) and gains of its relaxations, shape (2, K)."""
+        given = np.array([self.time_constants, self.gains])
+        return (
+            given
+            if isinf(self.exponent)
+            else np.array([_power_times(self.exponent), self.gain * _power(self.exponent)])
+        )
+
     @property
     def unsure(self) -> Unsure:
         """What relaxes at the start, and creep that is slower than the records."""
+        if not isinf(self.exponent):
+            soon = ((tau, gain) for tau, gain in self.chain.T.tolist() if tau < UNSURE_FROM)
+            return Unsure(tuple(soon), self.exponent * self.gain * UNSURE_FROM**self.exponent)
         count, times = len(self.gains), [log(each) for each in self.time_constants]
         spacing = (max(times) - min(times)) / max(count - 1, 1)
         # A single relaxation stands for a decade. What is slower is in no record, so that all of it is unsure.
@@ -113,13 +145,16 @@ class Creep(EffectBase):
         moved = moved - moved[:1]
         from slpi_ros.effects.paths import relaxed
 
-        crept = relaxed(moved, np.array(self.gains), np.array(self._holds(grid.dt)))
+        gains = self.chain[1]
+        crept = relaxed(moved, gains, np.array(self._holds(grid.dt)))
         crept, step = grid.off(crept), around.step(signal)
         if self.origin < inf and signal.size:
-            crept += sum(self.gains) * (float(signal[0]) - step - self.origin)
+            crept += sum(gains) * (float(signal[0]) - step - self.origin)
         if step or self.initial:
-            for gain, tau in zip(self.gains, self.time_constants, strict=True):
-                crept += gain * (step - (step + self.initial) * np.exp(-around.since / tau))
+            # What a power of time had to go before the record has no bound, and counts from its start.
+            known = step if isinf(self.exponent) else step + self.initial
+            for tau, gain in self.chain.T.tolist():
+                crept += gain * (known - (step + self.initial) * np.exp(-around.since / tau))
         return signal + crept
 
     @classmethod
@@ -134,6 +169,11 @@ class Creep(EffectBase):
                 starting = _settling(taus.tolist(), context.around, context.used)
                 columns = np.column_stack([starting, *cls._creeping(taus, context)])
                 yield Candidate(columns, partial(cls._each, taus), taus.size, starting.shape[1])
+            for exponent in POWERS:
+                unit = cls(exponent=exponent, gain=1.0)
+                starting = unit.starting(context.around, context.used)
+                columns = np.column_stack([starting, unit.apply(context.h, context.around) - context.h])
+                yield Candidate(columns, partial(cls._of_power, exponent), 1, starting.shape[1], group=1)
         for slow in LAW_TO:
             first, last = max(FASTEST, LAW_SAMPLES * step), slow * most
             if last > 10 * first:
@@ -145,6 +185,10 @@ class Creep(EffectBase):
     @classmethod
     def _creeping(cls, taus: FloatArray, context: ResidualContext) -> list[FloatArray]:
         return [cls((tau,), (1.0,)).apply(context.h, context.around) - context.h for tau in taus.tolist()]
+
+    @classmethod
+    def _of_power(cls, exponent: float, gains: FloatArray) -> "Creep | None":
+        return cls(exponent=exponent, gain=float(gains[0])) if 0.0 < gains[0] < LARGEST_SOON else None
 
     @classmethod
     def _law(cls, taus: FloatArray, gains: FloatArray) -> "Creep | None":
@@ -183,32 +227,42 @@ class Creep(EffectBase):
 
     @property
     def at_bound(self) -> bool:
-        """Whether a gain, or the sum of those that settle within a second, is at its upper bound."""
+        """Whether a gain, the sum of those that settle within a second, or an exponent is at its upper bound."""
+        if not isinf(self.exponent):
+            return not (self.gain < (1.0 - NEAR) * LARGEST_SOON and self.exponent < (1.0 - NEAR) * MOST_POWER)
         soon = sum(gain for tau, gain in zip(self.time_constants, self.gains, strict=True) if tau < SOON)
         return not (max(self.gains) < (1.0 - NEAR) * LARGEST and soon < (1.0 - NEAR) * LARGEST_SOON)
 
     def starting(self, around: EffectContext, used: Mask, *, older: bool = False) -> FloatArray:
         """Return the decay of creep from a move before each record, shape (N, k), one column per unknown move."""
-        return _settling(self.time_constants, around, used, older=older)
+        if isinf(self.exponent):
+            return _settling(self.time_constants, around, used, older=older)
+        return _settling(_power_times(self.exponent), around, used, _power(self.exponent), older=older)
 
     def started(self, amplitudes: FloatArray, records: int) -> "Creep":
         """Return the creep with the move before the records (`initial`) if several records agree on it."""
-        if records == 1 or amplitudes.size != records or not self.gains[0]:
+        gain = self.gains[0] if self.gains else self.gain
+        if records == 1 or amplitudes.size != records or not gain:
             return self
-        moves = -amplitudes / self.gains[0]
+        moves = -amplitudes / gain
         initial = float(np.mean(moves))
         alike = bool(np.all(np.abs(moves - initial) <= BEGAN_ALIKE * abs(initial)))
         return replace(self, initial=initial) if alike else self
 
     def describe(self) -> str:
-        """Describe the magnitude and the time constants."""
+        """Describe the magnitude, and the time constants or the power of time."""
+        if not isinf(self.exponent):
+            return (
+                f"after a move the stage creeps on with the power {self.exponent:.3g} of time, by "
+                f"{self.gain * 100:.3g} % of it in 1 s and {self.gain * 100**self.exponent * 100:.3g} % in 100 s"
+            )
         slow, fast = max(self.time_constants), min(self.time_constants)
         span = f"{fast:.3g} s" if slow == fast else f"{fast:.3g} to {slow:.3g} s"
         return f"after a move the stage creeps on by {sum(self.gains) * 100:.3g} % of it, with time constants of {span}"
 
     def laws(self) -> Mapping[str, Any]:
         """Return time constants (s), gains and origin (m) for the compiled inverse."""
-        return {"relaxations": np.array([self.time_constants, self.gains]), "rest_of_creep": self.origin}
+        return {"relaxations": self.chain, "rest_of_creep": self.origin}
 
     def anchored(self, rest: float) -> "Creep":
         """Return the creep with the origin `rest` (m) unless it has one."""
@@ -219,14 +273,14 @@ class Creep(EffectBase):
         return StreamingCreep(self)
 
     def _holds(self, dt: float) -> list[Hold]:
-        return [hold(dt, tau) for tau in self.time_constants]
+        return [hold(dt, tau) for tau in self.chain[0].tolist()]
 
 
 class StreamingCreep(StreamingBase):
     """Streaming (sample by sample) creep."""
 
     def __init__(self, creep: Creep) -> None:
-        self._creep = creep
+        self._creep, self._gains = creep, creep.chain[1].tolist()
         self.start(0.0)
         self._over(0.0)
 
@@ -234,7 +288,7 @@ class StreamingCreep(StreamingBase):
         """Initialise to equilibrium at `x` (m)."""
         self._origin = self._creep.anchored(x).origin
         self._input = x - self._origin
-        self._states = [self._input] * len(self._creep.gains)
+        self._states = [self._input] * len(self._gains)
 
     def forward(self, dt: float, x: float) -> float:
         """Advance by `dt` (s) to the displacement `x` (m) and return the displacement with creep (m)."""
@@ -259,8 +313,9 @@ class StreamingCreep(StreamingBase):
         """Take over the state of another model's creep at the input `x` (m)."""
         # Relaxations with a time constant that `other` has, too, continue; all others start in equilibrium.
         self.start(x)
-        known = dict(zip(other._creep.time_constants, other._states, strict=True))
-        self._states = [self._input + known.get(tau, other._input) - other._input for tau in self._creep.time_constants]
+        known = dict(zip(other._creep.chain[0].tolist(), other._states, strict=True))
+        taus = self._creep.chain[0].tolist()
+        self._states = [self._input + known.get(tau, other._input) - other._input for tau in taus]
 
     def snapshot(self) -> tuple[float, ...]:
         """Return origin, last motion from the origin, and states of the relaxations (m)."""
@@ -288,7 +343,7 @@ class StreamingCreep(StreamingBase):
         return crept
 
     def _over(self, dt: float) -> None:
-        gains, self._dt, self._holds = self._creep.gains, dt, self._creep._holds(dt)
+        gains, self._dt, self._holds = self._gains, dt, self._creep._holds(dt)
         self._kept = [gain * one.kept for gain, one in zip(gains, self._holds, strict=True)]
         self._now = self._before = 0.0
         # Not `sum`, which rounds otherwise than the compiled inverse.
@@ -305,23 +360,51 @@ def _reduced(time_constants: Sequence[float], gains: Sequence[float]) -> tuple[f
     return tuple(gain * share if tau < SOON else gain for tau, gain in zip(time_constants, gains, strict=True))
 
 
-def _settling(time_constants: Sequence[float], around: EffectContext, used: Mask, *, older: bool = False) -> FloatArray:
+def _power_times(exponent: float) -> FloatArray:
+    """Return the time constants (s, (K,)) of the chain for a power of time."""
+    # What is faster, and what is slower, than all others is one relaxation each, with the same two moments.
+    ends = (CHAIN[0] / EDGE * exponent / (exponent + 1), CHAIN[-1] * EDGE * (2 - exponent) / (1 - exponent))
+    return np.concatenate([ends[:1], CHAIN, ends[1:]])
+
+
+def _power(exponent: float) -> FloatArray:
+    """Return the gains, shape (K,), of the chain for ``(t / 1 s)^exponent``."""
+    # ``t^n = n / Gamma(1 - n)`` times the integral of ``(1 - exp(-t / tau)) tau^(n - 1)`` over tau.
+    faster = (CHAIN[0] / EDGE) ** exponent / exponent
+    first, last = CHAIN[-1] * EDGE, _power_times(exponent)[-1]
+    slower = first ** (exponent - 1) / (1 - exponent) * last
+    every = np.concatenate([[faster], CHAIN**exponent * 2 * log(EDGE), [slower]])
+    return np.asarray(exponent / gamma(1 - exponent) * every)
+
+
+def _settling(
+    time_constants: Sequence[float] | FloatArray,
+    around: EffectContext,
+    used: Mask,
+    gains: FloatArray | None = None,
+    *,
+    older: bool = False,
+) -> FloatArray:
     """Return the decay of creep that began before each record, shape (N, k), one column per identifiable relaxation."""
-    # The logarithmic law has a single column, for a move just before the record. With `older` there is a second one,
-    # for a move one record duration before the record, of which only the slow part remains.
+    # A law, logarithmic or with the `gains` of a power of time, has a single column, for a move just before the record.
+    # With `older` there is a second one, for a move one record duration before it, of which only the slow part remains.
     whole = []
     for own in range(max(len(around.records), 1)):
-        for column in _settling_of(time_constants, around.split(around.t)[own], around.split(used)[own], older):
+        for column in _settling_of(time_constants, around.split(around.t)[own], around.split(used)[own], older, gains):
             parts = [np.zeros_like(t) for t in around.split(around.t)]
             parts[own] = column
             whole.append(np.concatenate(parts))
     return np.column_stack([np.empty((around.t.size, 0)), *whole])
 
 
-def _settling_of(time_constants: Sequence[float], t: FloatArray, used: Mask, older: bool) -> list[FloatArray]:
+def _settling_of(
+    time_constants: Sequence[float] | FloatArray, t: FloatArray, used: Mask, older: bool, gains: FloatArray | None
+) -> list[FloatArray]:
     times = t[used]
     since = np.maximum(t - times[0], 0.0)
     if len(time_constants) >= LAW_FEWEST:
         ages = (0.0, float(times[-1] - times[0])) if older else (0.0,)
-        return [np.sum([np.exp(-(since + age) / tau) for tau in time_constants], axis=0) for age in ages]
+        shares, rest = (np.ones(len(time_constants)), 0.0) if gains is None else (gains, float(np.sum(gains)))
+        each = list(zip(time_constants, shares, strict=True))
+        return [np.sum([share * np.exp(-(since + age) / tau) for tau, share in each], axis=0) - rest for age in ages]
     return [np.exp(-since / tau) for tau in time_constants if tau < SOON_SETTLED * (times[-1] - times[0])]

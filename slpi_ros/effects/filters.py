@@ -22,6 +22,10 @@ LEAST_GAIN = 0.01
 # The exact inverse of the first-order hold oscillates from sample to sample after every reversal. Moving this share
 # of the previous input's weight to the present input damps the oscillation to a third per sample; ramps stay exact.
 DAMPING = 1 / 8
+# Below this step times the frequency (rad/s) a mode's response to a step is computed as a series of so many terms.
+SERIES, TERMS = 0.1, 16
+# Up to this difference of the squared damping from 1 both poles count as one.
+EQUAL = 1e-12
 # From this step times the frequency (rad/s) on a mode is not resolved, and only its lag is compensated.
 WIDEST = 3.0
 # Smallest spacing of the taps of the inverse of a mode, in units of 1 / w: smaller ones only make larger taps.
@@ -76,16 +80,29 @@ def hold(dt: float, time_constant: float) -> Hold:
 
 def mode_transition(omega: float, damping: float, dt: float) -> tuple[float, float, float, float]:
     """Return the state transition matrix of position and velocity of a mode over `dt` (s), row by row."""
-    decay_rate, rate = damping * omega, omega * sqrt(1 - damping * damping)
-    decay = exp(-decay_rate * dt)
-    cosine, sine = decay * cos(rate * dt), decay * sin(rate * dt) / rate
+    decay_rate, square = damping * omega, 1 - damping * damping
+    if square > 0.0:
+        rate, decay = omega * sqrt(square), exp(-decay_rate * dt)
+        cosine, sine = decay * cos(rate * dt), decay * sin(rate * dt) / rate
+    elif square < 0.0:
+        # Two lags; `slow` is the smaller pole without a difference of two that are nearly equal.
+        rate = omega * sqrt(-square)
+        slow, apart = exp(-(omega * omega) / (decay_rate + rate) * dt), -expm1(-2 * rate * dt)
+        cosine, sine = slow * (1 - apart / 2), slow * apart / (2 * rate)
+    else:
+        cosine = exp(-decay_rate * dt)
+        sine = dt * cosine
     return cosine + decay_rate * sine, sine, -(omega * omega) * sine, cosine - decay_rate * sine
 
 
 def mode_poles(omega: float, damping: float, dt: float) -> tuple[float, float]:
     """Return sum and product of the two discrete poles ``exp(s dt)`` of a mode."""
-    decay = exp(-damping * omega * dt)
-    return 2 * decay * cos(omega * sqrt(1 - damping * damping) * dt), decay * decay
+    square = 1 - damping * damping
+    if square >= 0.0:
+        decay = exp(-damping * omega * dt)
+        return 2 * decay * cos(omega * sqrt(square) * dt), decay * decay
+    fast = damping * omega + omega * sqrt(-square)
+    return exp(-omega * omega / fast * dt) + exp(-fast * dt), exp(-2 * damping * omega * dt)
 
 
 def filtered(numerator: ArrayLike, denominator: ArrayLike, signal: FloatArray) -> FloatArray:
@@ -101,8 +118,8 @@ class Mode:
     """Second-order mode ``y'' + 2 z w y' + w^2 y = w^2 h``, ``w = 2 pi frequency``."""
 
     frequency: float = parameter("Hz", "frequency", 1e-3, 1e7, fit=Fit("relative", least=1e-3))
-    # With more damping there is no resonance.
-    damping: float = parameter("", "damping ratio", 1e-6, 1, below=True, fit=Fit("relative", least=1e-3, most=0.4))
+    # Above 1 it is two lags.
+    damping: float = parameter("", "damping ratio", 1e-6, 2, fit=Fit("relative", least=1e-3, most=2.0))
     gain: float = parameter(
         "", "share of the static displacement; at most 1 in sum", 0, 1, default=1.0, required=True,
         fit=Fit("linear", 1e-5, LEAST_GAIN, 1.0, size=True),
@@ -118,6 +135,11 @@ class Mode:
         """Steady-state delay of the response to a ramp, seconds."""
         return 2 * self.damping / self.omega
 
+    @cached_property
+    def decay(self) -> float:
+        """Rate (1/s) at which a motion dies out, the slower one of two lags."""
+        return self.omega * (self.damping if self.damping <= 1 else 1 / (self.damping + sqrt(self.damping**2 - 1)))
+
     def response(self, frequency: FloatArray) -> NDArray[np.complex128]:
         """Return the frequency response, shape (K,), at frequencies (Hz, (K,))."""
         ratio = frequency / self.frequency
@@ -131,18 +153,32 @@ class Mode:
 
     def release(self, t: FloatArray) -> FloatArray:
         """Return the position, shape (N,), at times `t` (s) after a release from 1 at rest, with input 0."""
-        decay_rate = self.damping * self.omega
-        rate = self.omega * sqrt(1 - self.damping**2)
-        return np.asarray(np.exp(-decay_rate * t) * (np.cos(rate * t) + decay_rate / rate * np.sin(rate * t)))
+        # By its poles, which may be complex, real, or (nearly) equal.
+        decay_rate, square = self.damping * self.omega, self.damping**2 - 1
+        if abs(square) < EQUAL:
+            return np.asarray((1 + decay_rate * t) * np.exp(-decay_rate * t))
+        apart = self.omega * np.sqrt(complex(square))
+        slow, fast = apart - decay_rate, -apart - decay_rate
+        return np.asarray(((slow * np.exp(fast * t) - fast * np.exp(slow * t)) / (slow - fast)).real)
 
     def transfer(self, dt: float) -> tuple[FloatArray, FloatArray]:
         """Return the discrete transfer function with step `dt` (s) for an input linear between samples, (3,) each."""
         m11, m12, m21, m22 = mode_transition(self.omega, self.damping, dt)
-        late = self.lag / dt
         # Response of position and velocity to the input at the start and at the end of a step.
-        p0, p1 = late - m11 * (1 + late) + m12 / dt, 1 - late + m11 * late - m12 / dt
-        v1 = 1 / dt + m21 * late - m22 / dt
-        v0 = -1 / dt - m21 * (1 + late) + m22 / dt
+        if self.omega * dt < SERIES:
+            # From the step response as a power series, as differences would lose precision.
+            power, square = np.zeros(TERMS), (self.omega * dt) ** 2
+            for k in range(2, TERMS):
+                own = (k == 2) - power[k - 2]
+                power[k] = (square * own - 2 * self.damping * self.omega * dt * (k - 1) * power[k - 1]) / (k * (k - 1))
+            order = np.arange(TERMS)
+            p1, v1 = float((power / (order + 1)).sum()), float(power.sum()) / dt
+            p0, v0 = float(power.sum()) - p1, float((order * power).sum()) / dt - v1
+        else:
+            late = self.lag / dt
+            p0, p1 = late - m11 * (1 + late) + m12 / dt, 1 - late + m11 * late - m12 / dt
+            v1 = 1 / dt + m21 * late - m22 / dt
+            v0 = -1 / dt - m21 * (1 + late) + m22 / dt
         total, product = mode_poles(self.omega, self.damping, dt)
         denominator = np.array([1.0, -total, product])
         moved = np.array([p1, p0 - m22 * p1 + m12 * v1, m12 * v0 - m22 * p0])

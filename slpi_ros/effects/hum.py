@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from math import pi
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
@@ -22,7 +22,7 @@ from slpi_ros.effects.base import (
     wave,
 )
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, move, remaining
-from slpi_ros.effects.parameters import Fit, as_list, parameter
+from slpi_ros.effects.parameters import Fit, parameter
 
 # Number of spectral peaks that are tried, and lowest frequency (Hz); slower disturbances are drift or creep.
 PEAKS, SLOWEST = 4, 2.0
@@ -67,11 +67,6 @@ class Hum(EffectBase):
 
     lines: tuple[Line, ...] = parameter("", "spectral lines", count=(1, MOST_LINES))
     uncertainty: Mapping[str, float] = field(default_factory=dict)
-
-    @classmethod
-    def from_version_1(cls, given: dict[str, Any], spread: Any) -> tuple[dict[str, Any], Any]:
-        """Return the only line as a list."""
-        return as_list("lines", given, spread)
 
     def joined(self, other: "Hum") -> "Hum | None":
         """Return the lines of both."""

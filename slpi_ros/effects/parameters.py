@@ -64,6 +64,8 @@ class Parameter:
     none: bool = False
     # Smallest and largest length of a list or mapping.
     count: tuple[int, int] = (1, 10000)
+    # The list instead of which it is given, if any.
+    instead: str = ""
     # None if it is not fitted but chosen.
     fit: Fit | None = None
 
@@ -144,13 +146,6 @@ def with_leaves(value: Any, numbers: Iterator[float]) -> Any:
     if isinstance(value, Mapping):
         return {key: with_leaves(one, numbers) for key, one in value.items()}
     return tuple(with_leaves(one, numbers) for one in value) if isinstance(value, tuple) else next(numbers)
-
-
-def as_list(name: str, element: dict[str, Any], spread: Any) -> tuple[dict[str, Any], Any]:
-    """Return parameters and uncertainty of a document of version 1, of one element, as those of a list `name`."""
-    if isinstance(spread, dict):
-        spread = {f"{name}.0.{part}": deviation for part, deviation in spread.items()}
-    return {name: [element]}, spread
 
 
 def require_facts(effect: Any) -> None:

@@ -58,6 +58,7 @@ def heated(dt: FloatArray, v: FloatArray, time_constant: float, first: float, mo
     return before
 
 
+# Of any damping.
 hold, mode_transition, mode_poles = (
     compiled(filters.hold),
     compiled(filters.mode_transition),

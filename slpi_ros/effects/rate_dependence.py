@@ -25,7 +25,6 @@ from slpi_ros.effects.base import (
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter
-from slpi_ros.errors import ModelError
 from slpi_ros.hysteresis.rate_law import followed, solved
 
 if TYPE_CHECKING:
@@ -119,15 +118,6 @@ class RateDependence(EffectBase):
     def limited(cls, changed: dict[str, Any]) -> dict[str, Any]:
         """Return new parameters, with 0 for small states at the start."""
         return changed | {"initial": tuple(0.0 if abs(lead) < NO_START else lead for lead in changed["initial"])}
-
-    @classmethod
-    def from_version_1(cls, given: dict[str, Any], spread: Any) -> tuple[dict[str, Any], Any]:
-        """Refuse the retired form."""
-        if "exponent" in given:
-            raise ModelError(
-                "rate_dependence has a retired form (a power of the rate); identify and diagnose again from its bags"
-            )
-        return given, spread
 
     def plausible(self, context: FitContext) -> bool:
         """Return whether the records reach the rate above which loops widen; below it the law is a lag, ``c / s0``."""

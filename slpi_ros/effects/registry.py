@@ -1,6 +1,6 @@
 """Registry of the effects by name, and their conversion to and from documents."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, fields, is_dataclass
 from importlib import import_module
 from math import isinf
@@ -25,6 +25,7 @@ MODULES = (
     "gain_drift",
     "cross_coupling",
     "thermal_drift",
+    "clock",
     "steps",
     "sensor_periodic",
     "hum",
@@ -54,7 +55,7 @@ def to_document(effect: Effect) -> dict[str, Any]:
     """Return an effect as a JSON document in SI units."""
     return {
         "name": effect.name,
-        "parameters": {name: _plain(getattr(effect, name)) for name in facts_of(type(effect))},
+        "parameters": {name: _plain(value) for name, value in _given(effect)},
         "uncertainty": dict(effect.uncertainty),
     }
 
@@ -72,6 +73,14 @@ def from_document(document: Any) -> Effect:
     }
     effect: Effect = EFFECTS[name](**read)
     return effect
+
+
+def _given(effect: Effect) -> Iterator[tuple[str, Any]]:
+    """Yield the parameters by name, but optional lists that are empty and what counts only instead of one."""
+    for name, facts in facts_of(type(effect)).items():
+        value = getattr(effect, name)
+        if (facts.required or value != ()) and not (facts.instead and getattr(effect, facts.instead)):
+            yield name, value
 
 
 def _plain(value: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Resonance: lightly damped flexure modes that are excited by every reversal."""
+"""Resonance: modes of the mechanics, from those that ring after every reversal to well damped ones."""
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
@@ -36,12 +36,16 @@ from slpi_ros.effects.filters import (
     filtered,
     mode_poles,
 )
-from slpi_ros.effects.parameters import as_list, parameter, require
+from slpi_ros.effects.parameters import parameter, require
 
 # A zero is near a mode up to this ratio of the squared frequencies, which is the largest gain of `Exact`.
 NEAR = 10.0
 # Of a damping that is uncertain at least this share is assumed.
 LEAST_DAMPING = 0.5
+# Largest error of the inverse on a whole path, as a share of the path: more is by rounding, or by a path not from rest.
+ROUNDING = 1e-4
+# Number of time constants after which nothing is left of a motion that dies out.
+SETTLED = 30.0
 # Largest number of modes, and the smallest share of the motion beside the modes that is none by rounding.
 MOST_MODES, LEAST_REST = 10, 1e-9
 
@@ -200,15 +204,14 @@ class StreamingResonance(StreamingBase):
         self._asked = -1.0
 
 
-# Modes of the candidates: lowest frequency (Hz), highest as share of the sampling rate, number of spectral peaks.
-LOWEST, HIGHEST, LINES = 10.0, 0.45, 4
-DAMPINGS = (0.02, 0.08)
+# Modes of the candidates: lowest frequency (Hz) of spectral peaks and of the others, highest as share of the sampling
+# rate, number of spectral peaks and of the others; dampings of those at a peak, and of the others.
+LOWEST, SLOWEST, HIGHEST, LINES, OTHERS = 10.0, 3.0, 0.45, 4, 10
+DAMPINGS, WELL_DAMPED = (0.02, 0.08), (0.08, 0.5, 1.5)
 # Step of the derivatives by frequency, as a share of the half bandwidth, and by damping, as a share of that.
 STEP = 0.05
-# Largest damping ratio of a resonance; above it a mode hardly rings, and is a lag.
-MOST_DAMPING = 0.3
-# Highest frequency of any resonance, as a multiple of the highest excited frequency; above it only sharp ones can be
-# identified, with at most this damping ratio: turns excite them.
+# Highest frequency of any mode, as a multiple of the highest excited frequency; above it only sharp ones can be
+# identified, with at most this damping ratio: turns excite them, and others only shift in time.
 RINGS, SHARP = 2.0, 0.1
 
 
@@ -236,16 +239,21 @@ class Resonance(EffectBase):
     With ``D_k`` the polynomial of mode k, ``y = N / (D_1 D_2 ..) h``. The inverse is the product of ``D_k / N_k``, with
     the quadratic factors ``N_k`` of ``N`` in order of frequency. Where the zeros of ``N_k`` are near the mode this is
     `Exact`. Else, as ``1 / N_k`` hardly matters and the exact inverse of the sampled mode is unstable or large, the
-    factor is `Unringing`: it cancels the oscillation, follows ramps without error, and is bounded.
+    factor is `Unringing`: it cancels the oscillation, follows ramps without error, and is bounded. On a whole path what
+    is unstable runs backward in time, see `invert`.
     """
 
     name: ClassVar[str] = "resonance"
     acts_on: ClassVar[Signal] = "displacement"
     side: ClassVar[Side] = "stage"
-    what: ClassVar[str] = "lightly damped modes that ring after turns, each with its share of the motion"
-    compensated: ClassVar[str] = "exactly, if a part of the motion follows at once; else what would ring is taken out"
+    what: ClassVar[str] = "modes of the mechanics, ringing or well damped, each with its share of the motion"
+    compensated: ClassVar[str] = (
+        "on trajectories exactly; sample by sample if a part of the motion follows at once, else what would ring is "
+        "taken out"
+    )
     time_shift: ClassVar[TimeShift] = "partly"
     contains_shift: ClassVar[bool] = True
+    looks_ahead: ClassVar[bool] = True
     excitation: ClassVar[Excitation] = Excitation(
         "Small steps as fast as allowed with time to ring down, at three levels, then a sweep up to a sixth of the "
         "sampling rate: only a resonance rings on, at one frequency (sample at six times that or more).",
@@ -255,17 +263,12 @@ class Resonance(EffectBase):
         lacking=(0.2, "no record holds small quick steps, where a resonance, a delay or a lag would show"),
     )
 
-    modes: tuple[Mode, ...] = parameter("", "flexure modes", count=(1, MOST_MODES))
+    modes: tuple[Mode, ...] = parameter("", "modes of the mechanics", count=(1, MOST_MODES))
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         require(self, ("modes", self.rest >= 0, "of gains that are at most 1 in sum"))
-
-    @classmethod
-    def from_version_1(cls, given: dict[str, Any], spread: Any) -> tuple[dict[str, Any], Any]:
-        """Return the only mode as a list, with the gain that it had without saying so."""
-        return (given, spread) if "gain" in given else as_list("modes", given | {"gain": 1.0}, spread)
 
     @classmethod
     def limited(cls, changed: dict[str, Any]) -> dict[str, Any]:
@@ -278,9 +281,9 @@ class Resonance(EffectBase):
         return Resonance(_within(modes)) if len(modes) <= MOST_MODES else None
 
     def plausible(self, context: FitContext) -> bool:
-        """Return whether all modes ring, those far above the excited frequencies sharply: others shift in time."""
+        """Return whether the modes far above the excited frequencies ring sharply: others shift in time."""
         highest = RINGS * context.excited_frequency()
-        return all(mode.damping <= (MOST_DAMPING if mode.frequency <= highest else SHARP) for mode in self.modes)
+        return all(mode.frequency <= highest or mode.damping <= SHARP for mode in self.modes)
 
     @property
     def rest(self) -> float:
@@ -302,6 +305,48 @@ class Resonance(EffectBase):
                 y -= step * mode.gain * mode.release(around.since)
         return y
 
+    @by_record
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
+        """Return the displacement before the modes, shape (N,), metres, of which `apply` makes the signal.
+
+        Exact at each sample of a path that is even, resolves all modes and begins at rest; else sample by sample.
+        """
+        grid = around.uniform
+        if not grid.dt or grid.grid is not grid.t or any(mode.omega * grid.dt >= WIDEST for mode in self.modes):
+            return super().invert(signal, around)
+        found, still = self._inverted(signal, grid.dt), replace(around, start=None)
+        # Once more with what rounding leaves: modes that are slow against the sampling have poles near 1.
+        found += self._inverted(signal - self.apply(found, still), grid.dt)
+        if not np.max(np.abs(self.apply(found, still) - signal)) <= ROUNDING * np.ptp(signal):
+            return super().invert(signal, around)
+        if around.step(signal):
+            # The way to its beginning cannot be followed at once: as sample by sample, until that has settled.
+            ends = [SETTLED / mode.decay for mode in self.inverse_modes()]
+            ends += [4 * max(SPACING / mode.omega, grid.dt) for mode in self.modes]
+            first = signal[: int(np.searchsorted(around.since, max(ends), "right")) + 1]
+            around = replace(around, t=around.t[: first.size], grid=None)
+            found[: first.size] += super().invert(np.full_like(first, signal[0]), around) - signal[0]
+        return np.asarray(found)
+
+    def _inverted(self, signal: FloatArray, dt: float) -> FloatArray:
+        """Return the displacement before the modes, shape (N,), m, for a path from rest, with step `dt` (s)."""
+        from scipy.signal import lfilter
+
+        whole, shares = np.ones(1), self.rest * np.ones(1)
+        for mode in self.modes:
+            numerator, denominator = mode.transfer(dt)
+            shares = np.convolve(shares, denominator) + mode.gain * np.convolve(whole, numerator)
+            whole = np.convolve(whole, denominator)
+        roots = np.roots(shares)
+        outside = roots[np.abs(roots) >= 1]
+        stable = np.polydiv(shares, np.real(np.poly(outside)))[0]
+        moved = filtered(whole, stable, signal - signal[0]).astype(np.complex128)
+        for root in outside:
+            # ``x[n] = (x[n + 1] - moved[n + 1]) / root``, from the end, where the path goes on as it is.
+            last = moved[-1:] / (1 - root)
+            moved = np.append(lfilter([-1 / root], [1, -1 / root], moved[:0:-1], zi=last / root)[0][::-1], last)
+        return np.asarray(signal[0] + np.real(moved), dtype=np.float64)
+
     def factors(self) -> list[Unringing | Exact]:
         """Return the factors of the inverse, one for each mode, in equilibrium at 0 m."""
         ordered = sorted(self.modes, key=lambda mode: mode.frequency)
@@ -319,15 +364,16 @@ class Resonance(EffectBase):
 
     @classmethod
     def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
-        """Yield single modes at the strongest frequencies of the residual, and on a logarithmic grid."""
+        """Yield light modes at the strongest frequencies of the residual, and others on a logarithmic grid."""
 
         def column(mode: Mode) -> FloatArray:
             return cls((mode,)).apply(context.h, context.around) - context.h
 
         highest = HIGHEST / usual_step(context.t)
         found = [frequency for frequency in rhythms(context, LINES, LOWEST) if frequency < highest]
-        for frequency in (*found, *np.geomspace(min(2 * LOWEST, highest), highest, 10).tolist()):
-            for damping in DAMPINGS:
+        others = np.geomspace(min(SLOWEST, highest), highest, OTHERS).tolist()
+        for frequency in (*found, *others):
+            for damping in DAMPINGS if frequency in found else WELL_DAMPED:
                 mode = Mode(frequency, damping)
                 columns = [column(mode)]
                 if frequency in found and damping == DAMPINGS[0]:
@@ -370,7 +416,9 @@ class Resonance(EffectBase):
     def describe(self) -> str:
         """Describe frequency, damping and share of each mode."""
         parts = (f"{one.frequency:.4g} Hz (damping {one.damping:.3g}, share {one.gain:.3g})" for one in self.modes)
-        return f"the stage rings after reversals, at {' and '.join(parts)}"
+        rings = any(mode.damping < 1 / sqrt(2) for mode in self.modes)
+        does = "rings after reversals, at" if rings else "follows late, by damped modes of"
+        return f"the stage {does} {' and '.join(parts)}"
 
     def laws(self) -> Mapping[str, Any]:
         """Return modes, share beside them and factors for the compiled inverse."""
@@ -391,8 +439,7 @@ def _within(modes: Sequence[Mode]) -> tuple[Mode, ...]:
 def zeros(modes: Sequence[Mode], rest: float) -> list[Mode]:
     """Return the pairs of zeros of a superposition as modes, in order of frequency; one less if `rest` is 0."""
     # They are the modes of a stage that is held, ``y = 0``. With the forces ``sqrt(gain_k) w_k`` on the modes these are
-    # the eigenvalues, but one that is 0, of a skew-symmetric matrix minus the damping: all are stable, and all
-    # oscillate, as the modes do.
+    # the eigenvalues, but one that is 0, of a skew-symmetric matrix minus the damping: all are stable.
     w, loss = np.array([mode.omega for mode in modes]), np.diag([mode.lag * mode.omega**2 for mode in modes])
     force = np.sqrt([mode.gain for mode in modes]) * w
     if rest > LEAST_REST:
@@ -402,6 +449,11 @@ def zeros(modes: Sequence[Mode], rest: float) -> list[Mode]:
         stiff, loss = w[:, None] * free, free.T @ loss @ free
     nothing = np.zeros((stiff.shape[0],) * 2)
     roots = sorted(np.linalg.eigvals(np.block([[nothing, stiff], [-stiff.T, -loss]])), key=abs)[1:]
-    pairs = ((abs(one), -(one + other).real / 2) for one, other in zip(roots[::2], roots[1::2], strict=True))
+    # Of two that are conjugate one stands for both; those that do not oscillate are pairs in order.
+    lags = [root for root in roots if not root.imag]
+    pairs = [(root, root.conjugate()) for root in roots if root.imag > 0] + list(
+        zip(lags[::2], lags[1::2], strict=True)
+    )
+    found = [(sqrt(abs(one * other)), -(one + other).real / 2) for one, other in pairs]
     # With rounding errors.
-    return [Mode(float(omega) / (2 * pi), min(max(float(rate / omega), 1e-9), 1 - 1e-9)) for omega, rate in pairs]
+    return [Mode(omega / (2 * pi), max(float(rate / omega), 1e-9)) for omega, rate in sorted(found)]

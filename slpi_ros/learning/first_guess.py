@@ -1,6 +1,5 @@
 """First guess of the gains of a path that repeats: what the identified dynamics say, and how sure they are."""
 
-import math
 from collections.abc import Iterator
 from dataclasses import replace
 
@@ -68,7 +67,7 @@ def first_guess(axis: AxisModel, dt: float, frequency: FloatArray) -> tuple[Comp
 def ringing(axis: AxisModel) -> list[tuple[float, float]]:
     """Return frequency (Hz) of each identified mode, and the time (s) in which it falls by the factor e."""
     modes = [mode for effect in axis.stage_only.effects for mode in getattr(effect, "modes", ())]
-    return [(mode.frequency, 1.0 / (2.0 * math.pi * mode.frequency * mode.damping)) for mode in modes]
+    return [(mode.frequency, 1.0 / mode.decay) for mode in modes]
 
 
 def amplification(axis: AxisModel, frequency: FloatArray) -> FloatArray:

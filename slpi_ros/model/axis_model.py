@@ -2,6 +2,7 @@
 
 import warnings
 from collections.abc import Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from math import inf
@@ -338,12 +339,21 @@ class AxisModel:
     ) -> tuple[FloatArray, Mask]:
         """Return the voltage, as `compensate`, and where it is held at a limit, shape (N,) each.
 
-        It is that of `stream`, but for a delay, which is compensated by preview, and for models that are not causal.
+        It is that of `stream`, but for a delay, which is compensated by preview, for modes, which are inverted exactly
+        where the limits allow the whole path, and for models that are not causal.
         `coupled` (m), a number or of shape (N,), is the displacement that other axes add.
         """
         allowed, around = self._allowed(limits), self._around(t)
         if not self.causal and max(allowed.slew, allowed.acceleration) == inf and not self.chain.around:
             return self._command_known_path(y - coupled, around, allowed, self.initial(start_memory))
+        if ahead := self._looking_ahead:
+            others = tuple(effect for effect in self.effects if effect not in ahead)
+            stream = replace(self, effects=others).stream(limits, start_memory)
+            start = replace(around, start=stream.uncoupled_displacement)
+            with suppress(UsageError):
+                v, held = stream.run(t, ahead[0].invert(backward(ahead[1:], y - coupled, around), start))
+                if not held.any():
+                    return backward([effect for effect in self.chain.before if effect.shift], v, around), held
         timed = self._timed
         if timed and self.surroundings:
             # They depend on time alone, and what comes after them is constant: undone for the whole path at once.
@@ -352,6 +362,13 @@ class AxisModel:
             self = replace(self, effects=rest)
         v, held = self.stream(limits, start_memory).run(t, y, coupled)
         return backward([effect for effect in self.chain.before if effect.shift], v, around), held
+
+    @property
+    def _looking_ahead(self) -> tuple[Effect, ...]:
+        """Effects on the axis itself from that on which looks ahead, if a path is inverted through all of them."""
+        own = self.chain.own
+        found = next((own[place:] for place, effect in enumerate(own) if effect.looks_ahead), ())
+        return () if any(effect.needs_voltage for effect in found) else found
 
     @property
     def _timed(self) -> tuple[Effect, ...]:

@@ -17,7 +17,8 @@ from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
 from slpi_ros.model.sensor import Sensor
 from slpi_ros.model.stage_model import StageModel
 
-SCHEMA, EARLIER = "slpi_ros/model/2", "slpi_ros/model/1"
+# Version 1 was never released.
+SCHEMA, EARLIER, RETIRED = "slpi_ros/model/3", "slpi_ros/model/2", "slpi_ros/model/1"
 # Names of the fields of `FitQuality`, in order; those from the fastest rate on are optional.
 QUALITY = (
     "rms_m", "maximum_m", "held_out_rms_m", "floor_rms_m", "samples", "covered", "source", "fastest_V_per_s",
@@ -50,12 +51,17 @@ def parse_model(text: str, source: str) -> StageModel:
     except (ValueError, RecursionError) as error:
         raise ModelError(f"{source}: not a model document: {error}; give a file written by 'slpi identify'") from None
     schema = document.get("schema") if isinstance(document, dict) else None
+    if schema == RETIRED:
+        raise ModelError(
+            f"{source}: schema is {schema!r}, which no release has had; identify the stage again from its bags"
+        )
     if schema not in (SCHEMA, EARLIER):
         found = textwrap.shorten(repr(schema), 80)
         raise ModelError(
             f"{source}: schema is {found}, this version reads {SCHEMA!r} and {EARLIER!r}; identify the stage again"
         )
-    _update(document, source)
+    # All that an earlier document may hold means the same.
+    document["schema"] = SCHEMA
     try:
         validate(document, "model", source)
     except RecursionError:
@@ -63,29 +69,8 @@ def parse_model(text: str, source: str) -> StageModel:
     return model_from(document, source)
 
 
-def _update(document: dict[str, Any], source: str) -> None:
-    """Make a document of an earlier version one of the present version; ModelError if an effect has a retired form."""
-    if document.get("schema") != EARLIER:
-        return
-    document["schema"], axes = SCHEMA, document.get("axes")
-    for axis, model in axes.items() if isinstance(axes, dict) else ():
-        effects = model.get("effects") if isinstance(model, dict) else None
-        for effect in effects if isinstance(effects, list) else ():
-            name, given, spread = (
-                effect.get(key) if isinstance(effect, dict) else None for key in ("name", "parameters", "uncertainty")
-            )
-            if not isinstance(name, str) or name not in registry.EFFECTS or not isinstance(given, dict):
-                continue
-            try:
-                parameters, uncertainty = registry.EFFECTS[name].from_version_1(given, spread)
-            except ModelError as error:
-                raise ModelError(f"{source}: axis {axis[:40]!r}: {error}") from None
-            effect |= {"parameters": parameters} | ({"uncertainty": uncertainty} if "uncertainty" in effect else {})
-
-
 def model_from(document: dict[str, Any], source: str) -> StageModel:
-    """Build a model from a document of any version, updated in place; ModelError, which begins with `source`."""
-    _update(document, source)
+    """Build a model from a valid document of any version; ModelError, which begins with `source`."""
     try:
         axes = {name: _axis_from(axis) for name, axis in document["axes"].items()}
     except (ModelError, OverflowError) as error:

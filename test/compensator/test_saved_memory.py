@@ -96,7 +96,7 @@ def test_another_document_is_not_overwritten(tmp_path, complete):
     save_model(MODEL, path)
     before = path.read_bytes()
     for _ in range(2):
-        with pytest.raises(ModelError, match="slpi_ros/model/2"):
+        with pytest.raises(ModelError, match="slpi_ros/model/3"):
             MemoryFile(str(path)).save(MODEL, SAVED.axes, complete)
     assert path.read_bytes() == before and not (tmp_path / "model.json.last").exists()
     for damaged in ("", "{", '{"schema": "slpi_ros/saved_memory/1"}', "[]", "\0" * 400):

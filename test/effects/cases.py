@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from slpi_ros.effects.base import Effect, EffectContext
+from slpi_ros.effects.clock import Clock
 from slpi_ros.effects.contact import Contact
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
@@ -39,6 +40,8 @@ def powers(low: float, high: float) -> st.SearchStrategy[float]:
 
 @st.composite
 def creeps(draw: st.DrawFn) -> Creep:
+    if draw(st.booleans()):
+        return Creep(exponent=draw(numbers(0.02, 0.9)), gain=draw(numbers(1e-3, 0.1)))
     gains = draw(st.lists(numbers(-0.02, 0.05).filter(bool), min_size=1, max_size=8))
     taus = draw(st.lists(powers(1e-3, 1e3), min_size=len(gains), max_size=len(gains)))
     return Creep(tuple(taus), tuple(gains))
@@ -93,11 +96,11 @@ def rate_laws(most: float = 3.0, leads: int = 0) -> st.SearchStrategy[RateDepend
 
 @st.composite
 def resonances(draw: st.DrawFn) -> Resonance:
-    """Draw one to three modes that carry all of the motion, or a part of it."""
+    """Draw one to three modes, ringing or well damped, that carry all of the motion, or a part of it."""
     shares = draw(st.lists(numbers(0.05, 1), min_size=1, max_size=3))
     total = draw(st.just(1.0) | numbers(0.02, 0.999))
     gains = (total * np.array(shares) / sum(shares)).tolist()
-    return Resonance(tuple(Mode(draw(powers(20, 2000)), draw(powers(1e-3, 0.5)), gain) for gain in gains))
+    return Resonance(tuple(Mode(draw(powers(20, 2000)), draw(powers(1e-3, 2) | st.just(1.0)), gain) for gain in gains))
 
 
 @st.composite
@@ -140,6 +143,7 @@ BY_NAME: dict[str, st.SearchStrategy[Effect]] = {
     "gain_drift": gain_drifts(),
     "cross_coupling": st.builds(CrossCoupling, st.dictionaries(st.sampled_from("yz"), numbers(-0.4, 0.4), min_size=1)),
     "thermal_drift": drifts(),
+    "clock": st.builds(Clock, numbers(-1e-3, 1e-3)),
     "steps": staircases(),
     "sensor_periodic": sensors(),
     "hum": st.builds(Hum, st.lists(LINES, min_size=1, max_size=3).map(tuple)),

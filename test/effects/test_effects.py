@@ -43,6 +43,7 @@ def test_every_effect_has_its_side_and_acts_on_one_signal(effect):
     signals = dict.fromkeys(("delay", "lag", "slew", "saturation"), "voltage") | {"rate_dependence": "hysteresis"}
     assert effect.acts_on == signals.get(effect.name, "displacement")
     others = {"sensor_periodic": "sensor", "hum": "record", "thermal_drift": "record", "steps": "record"}
+    others["clock"] = "record"
     assert effect.side == others.get(effect.name, "stage")
     # No inverse for the stage holds what is not of the stage.
     chain = Chain.of((effect,))
@@ -199,8 +200,8 @@ def test_resonance_against_lsim(resonance, record):
 @given(creeps(), records("displacement"))
 def test_creep_against_python_control(creep, record):
     t, h = np.arange(record.signal.size) * record.around.t[1], record.signal - record.signal[0]
-    taus = np.array(creep.time_constants)
-    system = control.ss(np.diag(-1 / taus), (1 / taus)[:, None], np.array([creep.gains]), [[1.0]])
+    taus, gains = creep.chain
+    system = control.ss(np.diag(-1 / taus), (1 / taus)[:, None], gains[None], [[1.0]])
     expected = control.forced_response(system, t, h).outputs
     np.testing.assert_allclose(creep.apply(h, EffectContext(t)), expected, rtol=0, atol=1e-9 * record.span)
 
@@ -239,6 +240,9 @@ RESONANCES = {
     "two far apart": (((60.0, 0.02, 0.9), (1500.0, 0.02, 0.1)), 1e-2),
     "three": (((100.0, 0.05, 0.5), (150.0, 0.01, 0.3), (400.0, 0.02, 0.2)), 0.02),
     "three, a part": (((100.0, 0.05, 0.5), (150.0, 0.01, 0.2), (400.0, 0.02, 0.1)), 1e-3),
+    "well damped": (((6.5, 0.45, 1.0),), 0.2),
+    "two lags": (((6.5, 2.0, 1.0),), 0.15),
+    "well damped, a part": (((6.5, 1.5, 0.4), (90.0, 0.02, 0.3)), 1e-3),
     "two alike": (((100.0, 0.01, 0.3), (100.0, 0.01, 0.3)), 1e-3),
 }
 
@@ -257,17 +261,17 @@ def test_modes_are_compensated(case):
     resonance, t = Resonance(tuple(Mode(*mode) for mode in modes)), np.arange(10_000) * 1e-4
     path, around = 1e-5 * np.sin(np.pi * t) ** 4 * np.sin(2 * np.pi * 5 * t), EffectContext(t)
     most = share * np.abs(resonance.apply(path, around) - path).max()
-    assert np.abs(resonance.apply(resonance.invert(path, around), around) - path).max() < most
+    assert np.abs(resonance.apply(resonance.invert(path, around), around) - path).max() < max(1e-6 * most, 1e-12 * 1e-5)
     assert np.abs(compensated(resonance, t, path) - path).max() < most
 
 
 @pytest.mark.parametrize("case", RESONANCES)
 def test_a_kick_ends_the_ringing(case):
-    """After the wish has come to rest, so does the stage, within a fraction of a period."""
+    """After the wish has come to rest, so does the stage, within a fraction of a period of the slowest mode."""
     resonance, t = Resonance(tuple(Mode(*mode) for mode in RESONANCES[case][0])), np.arange(5000) * 1e-4
     wish = 1e-5 * np.clip(t / 0.05, 0, 1)
     rings = resonance.apply(wish, EffectContext(t)) - wish
-    settled = t > 0.05 + 0.01
+    settled = t > 0.05 + 1.0 / min(mode.frequency for mode in resonance.modes)
     assert np.abs(compensated(resonance, t, wish) - wish)[settled].max() < 0.02 * np.abs(rings)[settled].max()
 
 
@@ -284,7 +288,7 @@ def test_zeros_make_up_the_resonance(resonance):
     expected = resonance.rest + sum(mode.gain * response(mode) for mode in resonance.modes)
     product = np.prod([response(mode) for mode in resonance.modes], axis=0)
     for zero in found:
-        assert 0 < zero.damping < 1
+        assert zero.damping > 0
         product = product / response(zero)
     np.testing.assert_allclose(product, expected, rtol=1e-6)
 
@@ -407,7 +411,7 @@ MODE, LINE = {"frequency": 100.0, "damping": 0.1}, {"frequency": 50.0, "amplitud
         ("resonance", {"modes": [MODE] * 11}),
         ("resonance", {"modes": [{"frequency": 100.0}]}),
         ("resonance", {"modes": [MODE | {"more": 1.0}]}),
-        ("resonance", {"modes": [MODE | {"damping": 1.0}]}),
+        ("resonance", {"modes": [MODE | {"damping": 2.1}]}),
         ("resonance", {"modes": [MODE | {"frequency": 0.0}]}),
         ("resonance", {"modes": [MODE | {"frequency": float("nan")}]}),
         ("resonance", {"modes": [MODE | {"gain": -0.1}]}),

@@ -14,6 +14,7 @@ from export.stages import EVERY, KINDS, one_axis, stages, two_axes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.filters import Mode
 from slpi_ros.effects.hum import Hum, Line
 from slpi_ros.effects.lag import Lag
@@ -79,6 +80,21 @@ def test_pauses_with_a_slow_mode(tmp_path, frequency, slew):
     stage = ExportedStage.of(one_axis("pi", (Resonance((Mode(frequency, 0.3, 1.0),)),)), replace(FREE, slew=slew))
     for seed in (1, 2, 3):
         assert (differences(stage, tmp_path, *path(stage, 1500, seed)) <= AGREES).all()
+
+
+@pytest.mark.parametrize(
+    "effect",
+    [
+        Resonance((Mode(6.5, 0.45, 1.0),)),
+        Resonance((Mode(60.0, 1.0, 1.0),)),
+        Resonance((Mode(40.0, 2.0, 0.5), Mode(300.0, 0.02, 0.3))),
+        Creep(exponent=0.25, gain=0.03),
+    ],
+    ids=["damped", "critical", "two lags beside a mode", "power of time"],
+)
+def test_any_damping_and_a_power_of_time(tmp_path, effect):
+    stage = ExportedStage.of(one_axis("pi", (effect,)), FREE)
+    assert (differences(stage, tmp_path, *path(stage, 800)) <= AGREES).all()
 
 
 def test_a_mode_that_is_too_slow_is_refused_by_name():

@@ -1,19 +1,21 @@
 import copy
 import json
 import os
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
+from effects.cases import EVERY
+from hypothesis import assume, given
 from hypothesis import strategies as st
 from strategies import assert_same_model, axis_models, two_axes
 
+from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.filters import Mode
-from slpi_ros.effects.hum import Hum, Line
 from slpi_ros.effects.resonance import Resonance
 from slpi_ros.errors import ModelError
-from slpi_ros.model.document import EARLIER, SCHEMA, format_model, load_model, model_from, parse_model, save_model
+from slpi_ros.model.document import EARLIER, RETIRED, SCHEMA, format_model, load_model, parse_model, save_model
 from slpi_ros.model.stage_model import StageModel
 
 MODEL = two_axes()
@@ -63,68 +65,79 @@ def test_files_keep_every_bit(tmp_path):
 
 
 def test_units_and_version_stand_in_the_document():
-    assert DOCUMENT["schema"] == SCHEMA == "slpi_ros/model/2"
+    assert DOCUMENT["schema"] == SCHEMA == "slpi_ros/model/3"
     assert DOCUMENT["axes"]["x"]["voltage_range_V"] == [0.0, 100.0]
     assert DOCUMENT["axes"]["x"]["start"] == {"voltage_V": 0.0, "displacement_m": 2e-6, "history_V": [0.0, 60.0, 20.0]}
     assert DOCUMENT["axes"]["y"]["hysteresis"] == {"thresholds_V": [0.0, 4.0], "weights_m_per_V": [1e-7, 2e-8]}
 
 
 @pytest.mark.parametrize(
-    "version", ["slpi_ros/model/3", "slpi_ros/diagnosis/2", "", None, 1, ["slpi_ros/model/1"], {"a": 1}]
+    "version", ["slpi_ros/model/4", "slpi_ros/diagnosis/2", "", None, 1, ["slpi_ros/model/1"], {"a": 1}]
 )
 def test_wrong_version(version):
     refused(changed("schema", to=version), "schema is ")
 
 
-def of_version_1(*effects: object) -> str:
-    document = copy.deepcopy(DOCUMENT) | {"schema": EARLIER}
-    document["axes"]["x"]["effects"] = list(effects)
-    return json.dumps(document)
-
-
-RINGING = {"name": "resonance", "parameters": {"frequency": 100.0, "damping": 0.02}, "uncertainty": {"damping": 1e-3}}
 HUMMING = {"name": "hum", "parameters": {"frequency": 50.0, "amplitude": 1e-9, "phase": 0.5}}
-RATE = {"name": "rate_dependence", "parameters": {"widening": 0.1, "exponent": 0.1}}
 
 
-def test_version_1_is_read_and_version_2_is_written():
-    """Scalars of resonance and hum become lists of one; all else is as it was."""
-    model = parse_model(of_version_1(RINGING, HUMMING), "here.json")
-    ringing = Resonance((Mode(100.0, 0.02, 1.0),), {"modes.0.damping": 1e-3})
-    assert model.axes["x"].effects == (ringing, Hum((Line(50.0, 1e-9, 0.5),)))
-    document = json.loads(format_model(model))
-    assert document["schema"] == SCHEMA
-    assert document["axes"]["x"]["effects"][0] == {
-        "name": "resonance",
-        "parameters": {"modes": [{"frequency": 100.0, "damping": 0.02, "gain": 1.0}]},
-        "uncertainty": {"modes.0.damping": 1e-3},
-    }
-    assert document["axes"]["x"]["effects"][1]["parameters"] == {"lines": [HUMMING["parameters"]]}
-    assert_same_model(parse_model(of_version_1(), "here.json"), MODEL)
-    assert_same_model(model_from(json.loads(of_version_1(RINGING, HUMMING)), "here.json"), model)
+def test_version_1_is_refused():
+    """No release had it: its bags are there."""
+    refused(changed("schema", to=RETIRED), "identify the stage again from its bags")
+
+
+@given(EVERY)
+def test_version_2_gives_the_same_voltages(effect):
+    """Each effect with what version 2 could hold; it is written as version 3."""
+    assume(effect.name != "clock" and not (effect.name == "creep" and not effect.time_constants))
+    assume(all(mode.damping < 1.0 for mode in getattr(effect, "modes", ())))
+    model = StageModel({"x": replace(MODEL.axes["x"], effects=(effect,))})
+    text = format_model(model)
+    earlier = parse_model(text.replace(SCHEMA, EARLIER, 1), "here.json")
+    assert_same_model(earlier, model)
+    assert format_model(earlier) == text
+    t, y = np.arange(60) * 1e-2, 4e-6 + 1e-6 * np.sin(np.arange(60) * 0.1)
+    for one, other in zip(earlier.axes["x"].command(t, y), model.axes["x"].command(t, y), strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12, atol=0)
+
+
+def test_a_document_of_version_2_as_it_was_written():
+    """Every field that version 2 wrote is read, with the meaning that it had."""
+    written = [
+        {"name": "creep", "parameters": {"time_constants": [0.1, 1.0], "gains": [0.01, 0.02], "origin": 1e-6,
+                                         "initial": 0.0}, "uncertainty": {"gains.0": 1e-3}},
+        {"name": "resonance", "parameters": {"modes": [{"frequency": 100.0, "damping": 1e-6, "gain": 0.5}]},
+         "uncertainty": {}},
+    ]  # fmt: skip
+    document = copy.deepcopy(DOCUMENT) | {"schema": EARLIER}
+    document["axes"]["x"]["effects"] = written
+    found = parse_model(json.dumps(document), "here.json").axes["x"].effects
+    creep = Creep((0.1, 1.0), (0.01, 0.02), 1e-6, uncertainty={"gains.0": 1e-3})
+    assert found == (creep, Resonance((Mode(100.0, 1e-6, 0.5),)))
 
 
 @pytest.mark.parametrize(
-    "effect",
+    "parameters",
     [
-        RATE,
-        RINGING | {"parameters": {"modes": [{"frequency": 100.0, "damping": 0.02, "gain": 1.0}]}},
-        RINGING | {"parameters": {"frequency": 100.0, "damping": 0.02, "gain": 1.0}},
-        RINGING | {"parameters": {"frequency": 100.0}},
-        RINGING | {"parameters": {"frequency": [100.0], "damping": 0.02}},
-        RINGING | {"parameters": [100.0, 0.02]},
-        RINGING | {"uncertainty": [1e-3]},
-        RINGING | {"uncertainty": {"damping": -1.0}},
-        HUMMING | {"parameters": HUMMING["parameters"] | {"more": 1.0}},
-        {"name": ["hum"], "parameters": {}},
-        {"name": "hum"},
-        [],
-        None,
+        {},
+        {"exponent": 0.2},
+        {"gain": 0.02},
+        {"exponent": 1.0, "gain": 0.02},
+        {"exponent": 0.2, "gain": 0.02, "time_constants": [1.0], "gains": [0.1]},
+        {"exponent": None, "gain": 0.02},
+        {"time_constants": [1.0], "gains": [0.1], "gain": "a"},
+        {"time_constants": [1.0], "gains": []},
     ],
     ids=str,
 )
-def test_what_is_no_effect_of_version_1(effect):
-    refused(of_version_1(effect), "diagnose again from its bags" if effect is RATE else "")
+def test_creep_is_a_list_or_a_power_of_time(parameters):
+    def text(given: object) -> str:
+        return changed("axes", "x", "effects", to=[{"name": "creep", "parameters": given}])
+
+    good = json.loads(format_model(parse_model(text({"exponent": 0.2, "gain": 0.02}), "here.json")))
+    assert good["axes"]["x"]["effects"][0]["parameters"].keys() == {"origin", "initial", "exponent", "gain"}
+    if parameters != {"exponent": 0.2}:
+        refused(text(parameters))
 
 
 @pytest.mark.parametrize(

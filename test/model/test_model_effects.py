@@ -246,7 +246,7 @@ def test_documents_of_before_there_were_effects():
         {"name": "lag", "parameters": {"time_constant": 1, "more": 1}},
         {"name": "lag", "parameters": {"time_constant": 1}, "uncertainty": {"time_constant": -1}},
         {"name": "lag", "parameters": {"time_constant": 1}, "uncertainty": {"gain": 1}},
-        {"name": "resonance", "parameters": {"modes": [{"frequency": 100, "damping": 2, "gain": 1}]}},
+        {"name": "resonance", "parameters": {"modes": [{"frequency": 100, "damping": 3, "gain": 1}]}},
         {"name": "gremlins", "parameters": {}},
         {"name": "cross_coupling", "parameters": {"gains": {"y": 2}}},
         17,

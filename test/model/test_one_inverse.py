@@ -15,6 +15,7 @@ from strategies import axis_model, cases, paths
 
 from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.cross_coupling import CrossCoupling
+from slpi_ros.effects.resonance import Resonance
 from slpi_ros.errors import UsageError
 from slpi_ros.model.axis_model import START_MEMORIES, AxisModel
 from slpi_ros.model.limits import Limits
@@ -128,6 +129,8 @@ def test_a_path_is_compensated_as_its_samples_are(compiled, drawn):
         # The inverse of a resonance asks for a displacement that no voltage gives.
         expected = None
     with pytest.MonkeyPatch.context() as patch:
+        # On a whole path modes are inverted better than sample by sample.
+        patch.setattr(Resonance, "looks_ahead", False)
         for module in ("slpi_ros.model.streaming", "slpi_ros.hysteresis.turning_points"):
             patch.setattr(f"{module}.worth_compiling", lambda samples: compiled)
         if expected is None:

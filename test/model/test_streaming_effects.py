@@ -41,10 +41,30 @@ def followed(stream, y, t=T):
 
 
 @pytest.mark.parametrize("effects", [*SETS, (SENSOR,), (RATE, CREEP), (LAG, RATE)], ids=ids)
-def test_stream_gives_what_compensate_gives(effects):
+def test_stream_gives_what_compensate_gives(effects, monkeypatch):
+    # On a whole path modes are inverted better than sample by sample.
+    monkeypatch.setattr(Resonance, "looks_ahead", False)
     axis = with_effects(*effects)
     batch, _ = axis.compensate(T, path())
     np.testing.assert_allclose(followed(axis.stream(), path()), batch, rtol=0, atol=1e-12)
+
+
+@pytest.mark.parametrize("mode", [(150.0, 0.02), (6.5, 0.45), (30.0, 1.0), (12.0, 2.0)])
+@pytest.mark.parametrize("share", [1.0, 0.8])
+def test_a_whole_path_is_followed_through_modes(mode, share):
+    axis = with_effects(CREEP, Resonance((Mode(*mode, share),)))
+    v, held = axis.compensate(T, path(), start_memory="start")
+    error = axis.simulate(T, v) - path()
+    streamed = axis.simulate(T, followed(axis.stream(start_memory="start"), path())) - path()
+    assert not held.any()
+    assert np.abs(error).max() < min(1e-6 * SPAN, 0.1 * np.abs(streamed).max())
+
+
+def test_a_path_that_the_limits_hold_back_is_followed_as_its_samples_are():
+    """The exact inverse of a step needs more than the limits allow."""
+    axis, steps = with_effects(Resonance((Mode(6.5, 0.45),))), np.where(T < 1.0, 4e-6, 8e-6)
+    v, _ = axis.compensate(T, steps)
+    np.testing.assert_allclose(followed(axis.stream(), steps), v, rtol=0, atol=1e-9)
 
 
 @pytest.mark.parametrize("effects", SETS, ids=ids)

@@ -235,7 +235,7 @@ def test_refused_models_leave_the_old_one_working():
     good = format_model(model)
     hostile = [
         "", "garbage", "[1, 2", '{"schema": 3}', "[" * 100_000, "null", good[: len(good) // 2],
-        good.replace("slpi_ros/model/2", "slpi_ros/model/999"), good.replace('"x"', '"y"'), good.replace("0.0", "NaN"),
+        good.replace("slpi_ros/model/3", "slpi_ros/model/999"), good.replace('"x"', '"y"'), good.replace("0.0", "NaN"),
         good.replace("[0.0, 100.0]", "[200.0, 300.0]"), good.replace('"slpi"', '"magic"'),
     ]  # fmt: skip
     with compensator() as client:

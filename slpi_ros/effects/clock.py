@@ -1,0 +1,86 @@
+"""Clock: the displacement's stamps are of another clock than the voltage's."""
+
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from typing import ClassVar
+
+import numpy as np
+
+from slpi_ros.arrays import FloatArray
+from slpi_ros.effects.base import (
+    Candidate,
+    EffectBase,
+    EffectContext,
+    ResidualContext,
+    Side,
+    Signal,
+)
+from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining, safe_duration
+from slpi_ros.effects.parameters import Fit, Scales, parameter
+
+# Rate by which the fit's column is computed.
+STEP = 1e-6
+
+
+def _draw(path: DrivePath, limits: DriveLimits) -> None:
+    half = max(limits.quickest(1.0), safe_duration(1.0))
+    repeats = max(int(remaining(limits) / (2 * half)), 3)
+    loops(path, 0.0, 1.0, remaining(limits) / (2 * repeats), repeats)
+
+
+def _small(value: float, scales: Scales) -> float:
+    return 0.05 * scales.interval / max(scales.duration, scales.interval)
+
+
+@dataclass(frozen=True)
+class Clock(EffectBase):
+    """Stamps ``(1 + rate) t`` of the displacement at the time ``t`` from the record's start."""
+
+    name: ClassVar[str] = "clock"
+    acts_on: ClassVar[Signal] = "displacement"
+    side: ClassVar[Side] = "record"
+    what: ClassVar[str] = "the clock of the displacement's stamps goes faster or slower than that of the voltage's"
+    compensated: ClassVar[str] = "no, it is of the record's stamps"
+    excitation: ClassVar[Excitation] = Excitation(
+        "The same full loop over and over, as quick as allowed: the shift between voltage and displacement grows from "
+        "the first loop to the last, where a delay or a lag shifts all of them alike.",
+        _draw,
+        separates=("delay", "lag"),
+        order=2,
+    )
+
+    rate: float = parameter(
+        "", "by how much the displacement's clock goes faster, relative: 1e-6 is 1 ppm", -0.1, 0.1,
+        fit=Fit("linear", _small, size=True),
+    )  # fmt: skip
+    uncertainty: Mapping[str, float] = field(default_factory=dict)
+
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
+        """Return what is read at the stamps, shape (N,), metres."""
+        return self._at(1 / (1 + self.rate), signal, around)
+
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
+        """Return the displacement at times by the voltage's clock, shape (N,), metres."""
+        return self._at(1 + self.rate, signal, around)
+
+    def _at(self, scale: float, signal: FloatArray, around: EffectContext) -> FloatArray:
+        parts = zip(around.split(signal), around.split(around.t), strict=True)
+        return np.concatenate([
+            np.interp(t[:1] + scale * (t - t[:1]), t, part) if part.size else part for part, t in parts
+        ])  # fmt: skip
+
+    @classmethod
+    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+        """Yield the time derivative of the displacement, times the time from the record's start."""
+        seen = np.where(context.used, context.y - context.residual, context.h)
+        column = (cls(STEP).apply(seen, context.around) - seen) / STEP
+        yield Candidate(column[:, None], cls._of)
+
+    @classmethod
+    def _of(cls, gains: FloatArray) -> "Clock":
+        return cls(float(gains[0]))
+
+    def describe(self) -> str:
+        """Describe the rate."""
+        how = "faster" if self.rate > 0 else "slower"
+        return f"the displacement's clock goes {abs(self.rate) * 1e6:.3g} ppm {how} than the voltage's in this record"

@@ -69,8 +69,11 @@ class EachRecord(EffectBase):
         return tuple(course for part in self.parts for course in part.courses)
 
     def plausible(self, view: FitContext) -> bool:
-        """Return whether the parameters of each record are plausible."""
-        return all(part.plausible(view.of_record(k)) for k, part in enumerate(self.parts))
+        """Return whether the parameters of each record are plausible, and agree where they belong to all."""
+        first = self.parts[0]
+        return all(
+            part.plausible(view.of_record(k)) and first.agrees(part, view) for k, part in enumerate(self.parts)
+        )
 
     def only_plausible(self, view: FitContext) -> "EachRecord | None":
         """Return the effect of each record without those of its parts that are not plausible."""

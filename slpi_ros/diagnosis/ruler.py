@@ -13,6 +13,8 @@ from slpi_ros.diagnosis.held_out import Loss, in_blocks
 CHANCE = 0.001
 # A contribution below this share of the sensor's noise is not told.
 LEAST = 0.1
+# Least share, of the mean square that is there where an effect acts, that it explains.
+EXPLAINED = 0.8
 # Largest ratio of the errors on a record left out with a set that is better, and without.
 NO_WORSE = 1.05
 # Random signs of the blocks, and the share of them by which the number of independent sets is estimated.
@@ -33,20 +35,45 @@ def carries_over(one: Loss, other: Loss) -> bool:
     return bool(np.all(one.records[both] <= NO_WORSE**2 * other.records[both]))
 
 
-def chance(one: Loss, other: Loss, trials: float = 1.0) -> float:
-    """Return the probability that a fit that is no better looks so much better, as the best of `trials` ones.
+def share(one: Loss, without: Loss, noise: float) -> float:
+    """Return the share that an effect explains of what is there where it acts, beyond the noise (m)."""
+    # Weighted by what it predicts.
+    weights = (without.errors - one.errors) ** 2
+    there, left = (float(np.sum(weights * (each.errors**2 - noise**2))) for each in (without, one))
+    return 1.0 - left / there if there > 0.0 else 0.0
 
-    With the difference ``d`` of the predictions, the squares differ by ``d^2 + 2 d e``, where ``e`` are the errors of
-    the better one: chance is in the products ``d e`` alone.
+
+def chance(one: Loss, other: Loss, trials: float = 1.0) -> float:
+    """Return the probability that a fit that is no better looks so much better, as the best of `trials` ones."""
+    alone = min(1.0, 2.0 * min(_by_products(one, other), _by_shares(one, other)))
+    return float(max(-np.expm1(trials * np.log1p(-min(alone, 1.0 - 1e-12))), LEAST_CHANCE))
+
+
+def _by_products(one: Loss, other: Loss) -> float:
+    """Return the p-value of the fall of the squares, for what acts in few blocks.
+
+    With the difference ``d`` of the predictions the squares differ by ``d^2 + 2 d e``, where ``e`` are the errors of
+    the better fit: chance is in the products ``d e`` alone.
     """
     d = other.errors - one.errors
     products, fall = in_blocks(d * one.errors), float(np.sum(other.errors**2 - one.errors**2))
-    row = _in_a_row(products)
-    deviation = 2.0 * float(np.sqrt(np.sum(products**2) * row))
+    return _p_value(fall, 2.0 * float(np.sqrt(np.sum(products**2))), products)
+
+
+def _by_shares(one: Loss, other: Loss) -> float:
+    """Return the p-value of the mean share by which the squares of a block fall, whatever their size."""
+    a, b = one.blocks, other.blocks
+    shares = (b - a) / np.maximum(a + b, 1e-300)
+    around = shares - shares.mean()
+    return _p_value(float(np.sum(shares)), float(np.sqrt(np.sum(around**2))), around)
+
+
+def _p_value(gain: float, deviation: float, series: FloatArray) -> float:
+    """Return the one-sided p-value of a sum over blocks, for its deviation if the `series` had no correlation."""
+    row = _in_a_row(series)
     if not deviation > 0.0:
-        return LEAST_CHANCE if fall > 0.0 else 1.0
-    alone = float(stdtr(max(products.size / row - 1.0, 1.0), -fall / deviation))
-    return float(max(-np.expm1(trials * np.log1p(-min(alone, 1.0 - 1e-12))), LEAST_CHANCE))
+        return LEAST_CHANCE if gain > 0.0 else 1.0
+    return float(stdtr(max(series.size / row - 1.0, 1.0), -gain / (deviation * np.sqrt(row))))
 
 
 def independent_trials(before: Loss, tried: Sequence[Loss]) -> float:

@@ -13,15 +13,19 @@ from slpi_ros.diagnosis.effect_parameters import EachRecord, free
 from slpi_ros.diagnosis.held_out import RIDGE, HeldOut, Loss
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, drive_frequency, excited_frequency
-from slpi_ros.diagnosis.ruler import beats, chance, independent_trials
+from slpi_ros.diagnosis.ruler import EXPLAINED, beats, chance, independent_trials, share
 from slpi_ros.diagnosis.structures import STRUCTURES
 from slpi_ros.effects.base import Candidate, Effect, FitContext, is_course
 from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import ModelError
 from slpi_ros.identification.progress import report_progress
 
+import os
+DEBUG = bool(os.environ.get("DEBUG"))
 # Largest number of effects of a set; sets that are continued, and sets of a round that are refined.
-MOST_EFFECTS, WIDTH, REFINED = 4, 3, 6
+MOST_EFFECTS, WIDTH, MOST_TRIED = 4, 3, 20
+# Places of sets of so many forms among those that are fitted in a round.
+PLACES = ((1, 4), (2, 2), (3, 1))
 # Gauss-Newton steps of a set, and of the best one.
 STEPS, CONVERGED = 5, 15
 # Largest number of rounds, each with columns at new parameters.
@@ -52,6 +56,8 @@ def seen(now: Explanation) -> FitContext:
 
 def is_plausible(effect: Effect, now: Explanation) -> bool:
     """Return whether an effect of a joint fit may be what it is called."""
+    if any(leaf.at_bound for leaf in effect.free_leaves()):
+        return False
     return is_course(*effect.courses) and effect.plausible(seen(now)) and effect.in_phase(seen(now))
 
 
@@ -76,7 +82,7 @@ class Fitted:
         return (*sorted(effect.name for effect in self.effects), *self.structures), self.numbers
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Form:
     """One form of an effect, or of a defect of the hysteresis, with its place among the columns."""
 
@@ -90,6 +96,11 @@ class Form:
     def places(self) -> range:
         """Its columns."""
         return range(self.first, self.end)
+
+    @property
+    def kind(self) -> tuple[str, int]:
+        """Name, and group of forms that lead to other parameters."""
+        return self.name, getattr(self.candidate, "group", 0)
 
     @property
     def positive(self) -> range:
@@ -108,8 +119,8 @@ class Choice:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of the forms."""
-        return tuple(sorted(form.name for form in self.forms))
+        """Names of the forms, with the groups that lead to other parameters."""
+        return tuple(sorted(f"{name} {group}" for name, group in (form.kind for form in self.forms)))
 
 
 class Library:
@@ -170,6 +181,11 @@ class Library:
         chosen = [*kept, *(place for form in forms for place in form.places)]
         return self.held_out.loss(target, chosen, {place for form in forms for place in form.positive})
 
+    def ban(self, forms: Sequence[Form]) -> None:
+        """Leave out forms that have shown to mean nothing."""
+        banned = {form.kind for form in forms}
+        self.forms = [form for form in self.forms if form.kind not in banned]
+
     def screened(self, removed: Collection[str], taken: Sequence[Form], once: Collection[str]) -> list[Form]:
         """Return the forms that explain most of the fitted samples, the best of each group of each effect."""
         target, kept = self.base(removed)
@@ -223,8 +239,8 @@ class Library:
                 beam = sorted((one for one in grown.values() if one.loss.square < least), key=lambda one: one.loss.square)[:WIDTH]
         return sorted(found.values(), key=lambda one: one.loss.square)
 
-    def fit(self, choice: Choice) -> Explanation | None:
-        """Return the joint fit with a choice at first parameters; None if these are not admissible."""
+    def fit(self, choice: Choice) -> Explanation | Form:
+        """Return the joint fit with a choice at first parameters; the form of it that is not admissible, if one is not."""
         target, kept = self.base(choice.removed)
         chosen = [*kept, *(place for form in choice.forms for place in form.places)]
         positive = {place for form in choice.forms for place in form.positive}
@@ -235,21 +251,15 @@ class Library:
             if form.candidate is None:
                 fit = fit.beside(STRUCTURES[form.name](self.now))
                 continue
-            effect: Effect | None
-            if isinstance(form.candidate, Candidate):
-                own = np.array([at[place] for place in (form.positive or form.places)])
-                try:
-                    effect = form.candidate.effect(own)
-                except ModelError:
-                    return None
-            else:
-                effect = form.candidate
-            if effect is None:
-                return None
             try:
+                effect = form.candidate
+                if isinstance(effect, Candidate):
+                    effect = effect.effect(np.array([at[place] for place in (form.positive or form.places)]))
+                if effect is None:
+                    return form
                 fit = fit.adding(effect)
             except ModelError:
-                return None
+                return form
         return fit
 
 
@@ -293,18 +303,21 @@ class Search:
             self.pool[fitted.key] = fitted
         return fitted
 
-    def plausible(self, now: Explanation) -> Explanation | None:
-        """Return a joint fit without implausible parts of effects; None if an effect as a whole is implausible."""
+    def plausible(self, now: Explanation) -> tuple[Explanation, list[str]]:
+        """Return a joint fit without the effects, and parts of effects, that mean nothing, and the names of effects."""
+        nonsense: list[str] = []
         for effect in now.effects:
-            if effect.name in self.fixed or is_plausible(effect, now):
+            if effect.name in self.fixed or is_plausible(now.effect(effect.name), now):
                 continue
-            part = effect.only_plausible(seen(now))
-            if part is None or not free(part).size:
-                return None
-            now = now.replacing(effect.name, part).refined(1)
-            if not is_plausible(now.effect(effect.name), now):
-                return None
-        return now
+            part = now.effect(effect.name).only_plausible(seen(now))
+            if part is not None and free(part).size:
+                fewer = now.replacing(effect.name, part).refined(1)
+                if is_plausible(fewer.effect(effect.name), fewer):
+                    now = fewer
+                    continue
+            nonsense.append(effect.name)
+            now = now.without(effect.name)
+        return now, nonsense
 
     def run(self) -> tuple[Explanation, tuple[str, ...]]:
         """Return the best joint fit that was found, and the structures beside it."""
@@ -313,16 +326,31 @@ class Search:
         for _ in range(MOST_ROUNDS):
             report_progress(f"{len(now.effects)} effects, {now.held_out.rms * 1e9:.3g} nm left, trying others")
             library = Library(now, structures, self.names)
+            best, best_structures = now, structures
             choices = library.choices(self.fixed)
             self.trials = max(self.trials, independent_trials(now.held_out, [one.loss for one in choices]))
-            best, best_structures = now, structures
-            for choice in self.worth_fitting(choices, now):
-                first = library.fit(choice)
-                if first is None:
+            tried: set[tuple[Any, ...]] = set()
+            for _ in range(MOST_TRIED):
+                choice = next((one for one in self.worth_fitting(choices, now) if (one.removed, one.forms) not in tried), None)
+                if choice is None:
+                    break
+                tried.add((choice.removed, choice.forms))
+                found = library.fit(choice)
+                senseless = []
+                if isinstance(found, Form):
+                    library.forms.remove(found)
+                    choices = library.choices(self.fixed)
                     continue
-                fit = self.plausible(first.refined(STEPS))
-                if fit is None:
-                    continue
+                ref = found.refined(STEPS)
+                fit, nonsense = self.plausible(ref)
+                if DEBUG: print("       ", nonsense or "fit", set(choice.removed), choice.names, f"{choice.loss.rms*1e9:.2f}", f"{ref.held_out.rms*1e9:.2f}", f"{fit.held_out.rms*1e9:.2f}", [e.describe()[:150] for e in ref.effects if e.name in nonsense], flush=True)
+                if nonsense:
+                    # What is left of it may mean something.
+                    fit, worse = self.plausible(fit.refined(STEPS))
+                    library.ban([form for form in choice.forms if form.name in nonsense])
+                    choices = library.choices(self.fixed)
+                    if worse:
+                        continue
                 taken = (*structures, *(form.name for form in choice.forms if form.candidate is None))
                 self.note(fit, taken)
                 if fit.held_out.square < best.held_out.square:
@@ -339,12 +367,11 @@ class Search:
         return now, structures
 
     def worth_fitting(self, choices: Sequence[Choice], now: Explanation) -> list[Choice]:
-        """Return the choices with the least error, and the best ones with fewer forms."""
+        """Return the choices with the least error of each number of forms, few forms first."""
         better = [one for one in choices if one.forms and one.loss.square < now.held_out.square]
-        taken = better[:3]
-        for count in (1, 2):
-            taken += [one for one in better if len(one.forms) == count and one not in taken][: 2 if count == 1 else 1]
-        return taken[:REFINED]
+        return [
+            one for count, most in PLACES for one in [each for each in better if len(each.forms) == count][:most]
+        ]
 
 
 @dataclass(frozen=True)
@@ -403,28 +430,42 @@ class Judge:
     def beats(self, one: Explanation | Fitted, other: Explanation | Fitted) -> bool:
         """Return whether one set is better than another one."""
         a, b = (each.loss if isinstance(each, Fitted) else each.held_out for each in (one, other))
+        if DEBUG: print("        beats", [e.name for e in one.effects], [e.name for e in other.effects], f"{a.rms*1e9:.2f} {b.rms*1e9:.2f} p {chance(a,b,self.search.trials):.2g}")
         return beats(a, b, self._noise, self.search.trials)
 
     def answer(self) -> Answer:
         """Return the set with the fewest numbers of those that the best one does not beat."""
         now, structures = self.search.run()
         self._noise = now.noise
-        best = now
+        best = now = self.meaningful(now)
         for fitted in sorted(self.search.pool.values(), key=lambda one: (one.numbers, one.loss.square)):
             if fitted.numbers >= self.numbers(now):
                 break
             if not self.beats(best, fitted):
                 fewer = self.rebuilt(fitted).refined(CONVERGED)
-                if not self.beats(best, fewer):
+                if not self.beats(best, fewer) and not self.senseless(fewer):
                     now, structures = fewer, fitted.structures
                     break
         now, structures = self.needed(now, best, structures)
-        now, rivals = self.exchanged(now, best)
+        now, rivals = self.exchanged(now)
+        now, structures = self.needed(now, max(now, best, key=lambda one: -one.held_out.square), structures)
         return Answer(self.base, now, self.named(now, rivals), structures, (), self.search.trials)
 
     def free(self, now: Explanation) -> list[str]:
         """Return the names of the effects that were found."""
         return [effect.name for effect in now.effects if effect.name not in self.search.fixed]
+
+    def senseless(self, now: Explanation) -> dict[str, float]:
+        """Return the effects that explain too little of what is there where they act, with that share."""
+        shares = {name: share(now.held_out, now.without(name).held_out, now.noise) for name in self.free(now)}
+        if DEBUG: print("        shares", {k: round(v,2) for k,v in shares.items()})
+        return {name: found for name, found in shares.items() if found < EXPLAINED}
+
+    def meaningful(self, now: Explanation) -> Explanation:
+        """Return a joint fit without the effects that explain too little of what is there where they act."""
+        while found := self.senseless(now):
+            now = now.without(min(found, key=lambda name: found[name])).refined(CONVERGED)
+        return now
 
     def needed(
         self, now: Explanation, best: Explanation, structures: tuple[str, ...]
@@ -440,7 +481,7 @@ class Judge:
                 return now, structures
             now, structures = min(spare, key=lambda one: (self.numbers(one[0]), one[0].held_out.square))
 
-    def exchanged(self, now: Explanation, best: Explanation) -> tuple[Explanation, dict[str, list[tuple[str, float, bool]]]]:
+    def exchanged(self, now: Explanation) -> tuple[Explanation, dict[str, list[tuple[str, float, bool]]]]:
         """Return the fit with the better ones of its rivals, and for each effect the rivals, best first."""
         rivals: dict[str, list[tuple[str, float, bool]]] = {}
         for _ in range(MOST_EFFECTS):
@@ -457,8 +498,10 @@ class Judge:
                     if loss.square >= rest.held_out.square:
                         continue
                     first = library.fit(Choice(frozenset(), (form,), loss))
-                    fit = self.search.plausible(first.refined(CONVERGED)) if first is not None else None
-                    if fit is not None and self.numbers(fit) <= self.numbers(now):
+                    if isinstance(first, Form):
+                        continue
+                    fit, nonsense = self.search.plausible(first.refined(CONVERGED))
+                    if not nonsense and self.numbers(fit) <= self.numbers(now):
                         found.append((fit, form.name))
                 found.sort(key=lambda pair: pair[0].held_out.square)
                 rivals[name] = [(other, fit.held_out.rms, not self.beats(now, fit)) for fit, other in found]

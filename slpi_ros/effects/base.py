@@ -275,6 +275,10 @@ class EffectBase(Protocol):
         others = any(other.time_shift != "none" and other.name != self.name for other in context.effects)
         return self.time_shift != "only" or not others or abs(self.slow_shift) > HELD * context.step
 
+    def agrees(self, other: Any, context: "FitContext") -> bool:
+        """Return whether the same effect on another record has the parameters that all records share."""
+        return True
+
     def only_plausible(self, context: "FitContext") -> Self | None:
         """Return the effect without those of its parts, such as jumps, that are not plausible; None without parts."""
         return None

@@ -120,6 +120,12 @@ class Leaf(NamedTuple):
     value: float
 
     @property
+    def at_bound(self) -> bool:
+        """Whether its fit ended at a bound, where it stands for something else; gains may be 0 or 1."""
+        fit = self.facts.fit
+        return fit is not None and fit.kind != "linear" and not fit.least < self.value < fit.most and bool(self.value)
+
+    @property
     def free(self) -> bool:
         """Whether it is fitted: what is not there, or an equilibrium at the start, stays as it is."""
         fit = self.facts.fit

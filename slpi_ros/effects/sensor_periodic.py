@@ -26,8 +26,9 @@ from slpi_ros.effects.base import (
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining
 from slpi_ros.effects.parameters import Fit, parameter, require
 
-# Shortest and longest period (m), number of spectral peaks, and number of displacement bins of the candidates.
-SHORTEST, LONGEST, LINES, BINS = 50e-9, 2e-6, 4, 2**14
+# Shortest and longest period (m), of a quarter and of half a wavelength of lasers from the violet to 1.55 um; number of
+# spectral peaks, and number of displacement bins of the candidates.
+SHORTEST, LONGEST, LINES, BINS = 50e-9, 0.8e-6, 4, 2**14
 # Shortest period in rms rounding errors: rounding repeats with every digit, which is sqrt(12) times its rms.
 ROUNDING_PERIOD = 1.3 * 12**0.5
 # Largest difference of the zeros of records, as a share of the period, for a common error.
@@ -64,7 +65,7 @@ class SensorPeriodic(EffectBase):
 
     period: float = parameter(
         "m", "period in displacement, such as half a wavelength", 1e-12, 1e3,
-        fit=Fit("relative", lambda value, _: 1e-5 * abs(value), 1e-9),
+        fit=Fit("relative", lambda value, _: 1e-5 * abs(value), SHORTEST, LONGEST),
     )  # fmt: skip
     amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0, size=True))
     phase: float = parameter("rad", "phase at displacement 0", -1e3, 1e3, fit=Fit("angle", 1e-4))
@@ -77,6 +78,10 @@ class SensorPeriodic(EffectBase):
     def plausible(self, context: FitContext) -> bool:
         """Return whether the period is longer than that of rounding."""
         return bool(self.period > ROUNDING_PERIOD * context.rounding)
+
+    def agrees(self, other: "SensorPeriodic", context: FitContext) -> bool:
+        """Return whether the periods of two records differ by less than half a period over the motion."""
+        return abs(1.0 / self.period - 1.0 / other.period) * context.motion < 0.5
 
     def in_phase(self, context: FitContext) -> bool:
         """Return whether the phase is the same in all records."""

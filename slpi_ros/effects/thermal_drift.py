@@ -104,7 +104,7 @@ class ThermalDrift(EffectBase):
     @classmethod
     def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
         """Yield piecewise linear curves with an increasing number of knots."""
-        for knots in KNOTS:
+        for knots in KNOTS if float(np.ptp(context.t)) >= TAKES else ():
             times = np.linspace(context.t[0], context.t[-1], knots)
             # A constant is part of the displacement at rest.
             hats = np.column_stack([np.interp(context.t, times, row) for row in np.eye(knots)[1:]])

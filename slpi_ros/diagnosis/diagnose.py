@@ -12,10 +12,10 @@ from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.arrays.rates import fastest
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
-from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of, one_speed
+from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged, signals_of
 from slpi_ros.diagnosis.ruler import NO_WORSE, beats
-from slpi_ros.diagnosis.search import CONVERGED, Answer, Judge, Search, is_own, seen
+from slpi_ros.diagnosis.search import Answer, Judge, Search, is_own, seen
 from slpi_ros.diagnosis.structures import BIAS
 from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.chain import Chain
@@ -28,7 +28,7 @@ from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.refit import require_own
 from slpi_ros.identification.repeatability import Repeatability, repeatability_of
 from slpi_ros.io.record import Record, common_stage
-from slpi_ros.model.axis_model import ABOVE_NOISE, AxisModel, Start
+from slpi_ros.model.axis_model import AxisModel, Start
 from slpi_ros.model.sensor import IDEAL, corrected
 from slpi_ros.model.stage_model import StageModel
 

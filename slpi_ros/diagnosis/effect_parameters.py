@@ -71,9 +71,7 @@ class EachRecord(EffectBase):
     def plausible(self, view: FitContext) -> bool:
         """Return whether the parameters of each record are plausible, and agree where they belong to all."""
         first = self.parts[0]
-        return all(
-            part.plausible(view.of_record(k)) and first.agrees(part, view) for k, part in enumerate(self.parts)
-        )
+        return all(part.plausible(view.of_record(k)) and first.agrees(part, view) for k, part in enumerate(self.parts))
 
     def only_plausible(self, view: FitContext) -> "EachRecord | None":
         """Return the effect of each record without those of its parts that are not plausible."""

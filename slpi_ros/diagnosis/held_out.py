@@ -88,7 +88,9 @@ class Division:
         beside = np.column_stack([columns, np.ones(y.size)])
         whole = UNDETERMINED * (beside.T @ beside)
         whole[:-1, :-1] += matrix
-        gains = solved(whole, UNDETERMINED * (beside.T @ y) + np.append(vector, 0.0), [*(k in positive for k in chosen), False])
+        gains = solved(
+            whole, UNDETERMINED * (beside.T @ y) + np.append(vector, 0.0), [*(k in positive for k in chosen), False]
+        )
         own = np.append(self.own[list(chosen)], True)
         y = y - beside[:, ~own] @ gains[~own]
         beside = beside[:, own]
@@ -105,7 +107,9 @@ class HeldOut:
 
     # `divisions` and `whole`, the products of the columns, shape (K, K), the hysteresis eliminated, are in units of
     # the square of `unit` (m). `records` (n,) is the record of each judged sample.
-    def __init__(self, divisions: Sequence[Division], whole: FloatArray, records: IntArray, count: int, unit: float) -> None:
+    def __init__(
+        self, divisions: Sequence[Division], whole: FloatArray, records: IntArray, count: int, unit: float
+    ) -> None:
         self._divisions, self.whole, self._records, self._count, self._unit = divisions, whole, records, count, unit
 
     def loss(self, target: Sequence[int], chosen: Sequence[int], positive: Collection[int] = ()) -> Loss:

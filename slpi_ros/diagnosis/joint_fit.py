@@ -70,7 +70,8 @@ class Joint:
             self.predictable = like.predictable
         self.problem, self.evidence, self.u = evidence.problem(u), evidence, u
         # The same samples are judged whatever voltage the effects let through.
-        self._groups = like._groups if like else _groups(evidence.problem(evidence.v), evidence)
+        groups: list[IntArray] = like._groups if like else _groups(evidence.problem(evidence.v), evidence)
+        self._groups: list[IntArray] = groups
         self.everything = self.problem.design.rows(np.concatenate(self._groups))
         self._ends = np.cumsum([0, *(rows.size for rows in self._groups)]).tolist()
         # Sample of each row of the problem, and of each fitted row in the order of the groups.
@@ -113,10 +114,9 @@ class Joint:
         """Records of which blocks are left out, as the others, if there are any, cover too little of them."""
         if len(self.evidence.parts) == 1:
             return [0]
-        covered = [np.count_nonzero(self.predictable[rows]) for rows in self.evidence.slices]
-        judged = [self.predictable[self._samples[slice(*ends)]] for ends in pairwise(self._ends)]
-        rows = [sum(np.count_nonzero(own) for own in judged[k * (FOLDS + 1) + 1 : (k + 1) * (FOLDS + 1)]) for k in range(len(covered))]
-        return [k for k, count in enumerate(rows) if count < FEWEST_JUDGED]
+        judged = [np.count_nonzero(self.predictable[self._samples[slice(*ends)]]) for ends in pairwise(self._ends)]
+        first = range(0, len(judged), FOLDS + 1)
+        return [k for k, group in enumerate(first) if sum(judged[group + 1 : group + FOLDS + 1]) < FEWEST_JUDGED]
 
     def held_out(self, at: FloatArray) -> HeldOut:
         """Return the errors, on data left out, of columns `at` the fitted samples, shape (n, K), as of `sampled`."""
@@ -125,44 +125,37 @@ class Joint:
         products = [own.T @ own for own in parts]
         whole, inner = _sum(projected), _sum(products)
         held = [np.diag(_sum(products[k * each : (k + 1) * each])) > 0.0 for k in range(len(self.evidence.parts))]
-        place = self._places()
+        place, records = self._places()
         divisions = []
         for groups, factor, record in self._left:
             of_rest = whole - _sum([projected[group] for group in groups])
             x = _solved(factor, of_rest)
             rest = inner - _sum([products[group] for group in groups]) - of_rest.T @ x
             missed = np.concatenate([parts[group] - self.rows[group].predict(x) for group in groups])
-            others = _sum([own.astype(int) for k, own in enumerate(held) if k != record]) if len(held) > 1 else np.ones(at.shape[1])
-            own = held[record] & (others == 0) if record >= 0 else np.zeros(at.shape[1], dtype=bool)
+            own = np.zeros(at.shape[1], dtype=bool)
+            if record >= 0:
+                own = held[record] & ~np.any([each for k, each in enumerate(held) if k != record], axis=0)
             rest[own], rest[:, own] = 0.0, 0.0
-            fold = np.concatenate([np.full(parts[group].shape[0], group % each if record >= 0 else 0) for group in groups])
-            divisions.append(Division(np.asfortranarray(missed), rest, np.concatenate([place[group] for group in groups]), fold, own))
+            sizes = [parts[group].shape[0] for group in groups]
+            fold = np.repeat([group % each if record >= 0 else 0 for group in groups], sizes)
+            places = np.concatenate([place[group] for group in groups])
+            divisions.append(Division(np.asfortranarray(missed), rest, places, fold, own))
         total = inner - whole.T @ _solved(self.factor, whole)
-        records = np.repeat(np.arange(len(held)), self._counts)
         return HeldOut(divisions, total, records, len(held), self.problem.scale)
 
-    def _places(self) -> list[IntArray]:
-        """Return for each group where its rows are among the judged ones, in time order; -1: not judged."""
-        samples, each = self._samples, FOLDS + 1
-        judged = [self._judged_of(group, samples[slice(*ends)]) for group, ends in enumerate(pairwise(self._ends))]
-        whole = np.concatenate(judged)
-        order = np.argsort(samples[whole], kind="stable")
-        ranks = np.empty(order.size, dtype=np.int64)
-        ranks[order] = np.arange(order.size)
-        places = np.full(samples.size, -1)
-        places[whole] = ranks
-        self._counts = [int(sum(np.count_nonzero(judged[k * each + fold]) for fold in range(each))) for k in range(len(self.evidence.parts))]
-        return [places[slice(*ends)] for ends in pairwise(self._ends)]
-
-    def _judged_of(self, group: int, samples: IntArray) -> Mask:
-        record, fold = divmod(group, FOLDS + 1)
-        if fold == 0:
-            return np.zeros(samples.size, dtype=bool)
-        return np.ones(samples.size, dtype=bool) if record in self._judged_alone else self.predictable[samples]
+    def _places(self) -> tuple[list[IntArray], IntArray]:
+        """Return for each group where its rows are among the judged ones, in time order (-1: nowhere); their records."""
+        record, fold = np.divmod(np.repeat(np.arange(len(self._groups)), np.diff(self._ends)), FOLDS + 1)
+        judged = (fold > 0) & (np.isin(record, self._judged_alone) | self.predictable[self._samples])
+        places = np.full(self._samples.size, -1)
+        places[judged] = np.argsort(np.argsort(self._samples[judged], kind="stable"), kind="stable")
+        return [places[slice(*ends)] for ends in pairwise(self._ends)], np.sort(record[judged])
 
     @cached_property
     def predictable(self) -> Mask:
         """Mask of the samples, shape (N,), that the other records can predict for any initial state."""
+        if len(self.evidence.parts) == 1:
+            return np.zeros(self.evidence.t.size, dtype=bool)
         whole = self.everything.gram()
         found = np.zeros(self.evidence.t.size, dtype=bool)
         for k, samples in enumerate(self.evidence.slices):

@@ -8,11 +8,11 @@ from typing import Any
 
 import numpy as np
 
-from slpi_ros.arrays import FloatArray, IntArray
+from slpi_ros.arrays import FloatArray
 from slpi_ros.diagnosis.effect_parameters import EachRecord, free
 from slpi_ros.diagnosis.held_out import RIDGE, HeldOut, Loss
 from slpi_ros.diagnosis.joint_fit import Explanation
-from slpi_ros.diagnosis.prepare import Evidence, drive_frequency, excited_frequency
+from slpi_ros.diagnosis.prepare import drive_frequency, excited_frequency
 from slpi_ros.diagnosis.ruler import EXPLAINED, beats, chance, independent_trials, share
 from slpi_ros.diagnosis.structures import STRUCTURES
 from slpi_ros.effects.base import Candidate, Effect, FitContext, is_course
@@ -20,8 +20,6 @@ from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import ModelError
 from slpi_ros.identification.progress import report_progress
 
-import os
-DEBUG = bool(os.environ.get("DEBUG"))
 # Largest number of effects of a set; sets that are continued, and sets of a round that are refined.
 MOST_EFFECTS, WIDTH, MOST_TRIED = 4, 3, 20
 # Places of sets of so many forms among those that are fitted in a round.
@@ -208,7 +206,9 @@ class Library:
             places = list(form.places)
             own, wanted = whole[np.ix_(places, places)], vector[places]
             size = np.sqrt(np.maximum(np.diag(self.held_out.whole)[places], 1e-300))
-            gain = float(wanted / size @ np.linalg.solve(own / np.outer(size, size) + 1e-6 * np.eye(len(places)), wanted / size))
+            gain = float(
+                wanted / size @ np.linalg.solve(own / np.outer(size, size) + 1e-6 * np.eye(len(places)), wanted / size)
+            )
             key = form.name, getattr(form.candidate, "group", 0), form.numbers
             if key not in best or gain > best[key][0]:
                 best[key] = gain, form
@@ -236,7 +236,9 @@ class Library:
                             grown[one.names] = one
                 found.update({(removed, names): one for names, one in grown.items()})
                 least = min(choice.loss.square for choice in beam)
-                beam = sorted((one for one in grown.values() if one.loss.square < least), key=lambda one: one.loss.square)[:WIDTH]
+                beam = sorted(
+                    (one for one in grown.values() if one.loss.square < least), key=lambda one: one.loss.square
+                )[:WIDTH]
         return sorted(found.values(), key=lambda one: one.loss.square)
 
     def fit(self, choice: Choice) -> Explanation | Form:
@@ -246,15 +248,16 @@ class Library:
         positive = {place for form in choice.forms for place in form.positive}
         gains = self.held_out.gains(target, chosen, positive)
         at = dict(zip(chosen, (gains / self._size[chosen]).tolist(), strict=True))
-        fit = self.now.only([effect.name for effect in self.now.effects if effect.name not in choice.removed], refine=False)
+        fit = self.now.only(
+            [effect.name for effect in self.now.effects if effect.name not in choice.removed], refine=False
+        )
         for form in choice.forms:
             if form.candidate is None:
                 fit = fit.beside(STRUCTURES[form.name](self.now))
                 continue
             try:
-                effect = form.candidate
-                if isinstance(effect, Candidate):
-                    effect = effect.effect(np.array([at[place] for place in (form.positive or form.places)]))
+                own = np.array([at[place] for place in (form.positive or form.places)])
+                effect = form.candidate.effect(own) if isinstance(form.candidate, Candidate) else form.candidate
                 if effect is None:
                     return form
                 fit = fit.adding(effect)
@@ -331,19 +334,19 @@ class Search:
             self.trials = max(self.trials, independent_trials(now.held_out, [one.loss for one in choices]))
             tried: set[tuple[Any, ...]] = set()
             for _ in range(MOST_TRIED):
-                choice = next((one for one in self.worth_fitting(choices, now) if (one.removed, one.forms) not in tried), None)
+                choice = next(
+                    (one for one in self.worth_fitting(choices, now) if (one.removed, one.forms) not in tried), None
+                )
                 if choice is None:
                     break
                 tried.add((choice.removed, choice.forms))
                 found = library.fit(choice)
-                senseless = []
                 if isinstance(found, Form):
                     library.forms.remove(found)
                     choices = library.choices(self.fixed)
                     continue
                 ref = found.refined(STEPS)
                 fit, nonsense = self.plausible(ref)
-                if DEBUG: print("       ", nonsense or "fit", set(choice.removed), choice.names, f"{choice.loss.rms*1e9:.2f}", f"{ref.held_out.rms*1e9:.2f}", f"{fit.held_out.rms*1e9:.2f}", [e.describe()[:150] for e in ref.effects if e.name in nonsense], flush=True)
                 if nonsense:
                     # What is left of it may mean something.
                     fit, worse = self.plausible(fit.refined(STEPS))
@@ -369,9 +372,7 @@ class Search:
     def worth_fitting(self, choices: Sequence[Choice], now: Explanation) -> list[Choice]:
         """Return the choices with the least error of each number of forms, few forms first."""
         better = [one for one in choices if one.forms and one.loss.square < now.held_out.square]
-        return [
-            one for count, most in PLACES for one in [each for each in better if len(each.forms) == count][:most]
-        ]
+        return [one for count, most in PLACES for one in [each for each in better if len(each.forms) == count][:most]]
 
 
 @dataclass(frozen=True)
@@ -430,7 +431,6 @@ class Judge:
     def beats(self, one: Explanation | Fitted, other: Explanation | Fitted) -> bool:
         """Return whether one set is better than another one."""
         a, b = (each.loss if isinstance(each, Fitted) else each.held_out for each in (one, other))
-        if DEBUG: print("        beats", [e.name for e in one.effects], [e.name for e in other.effects], f"{a.rms*1e9:.2f} {b.rms*1e9:.2f} p {chance(a,b,self.search.trials):.2g}")
         return beats(a, b, self._noise, self.search.trials)
 
     def answer(self) -> Answer:
@@ -458,7 +458,6 @@ class Judge:
     def senseless(self, now: Explanation) -> dict[str, float]:
         """Return the effects that explain too little of what is there where they act, with that share."""
         shares = {name: share(now.held_out, now.without(name).held_out, now.noise) for name in self.free(now)}
-        if DEBUG: print("        shares", {k: round(v,2) for k,v in shares.items()})
         return {name: found for name, found in shares.items() if found < EXPLAINED}
 
     def meaningful(self, now: Explanation) -> Explanation:

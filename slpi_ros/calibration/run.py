@@ -511,7 +511,7 @@ def why(verified: Sequence[Mapping[str, TrackingError]], diagnosis: Diagnosis, e
     if lasting:
         said.append(f"{', '.join(lasting)} cannot be undone without feedback and will go on")
     if abs(worst.offset) > worst.rest:
-        creeps = any(effect.resembles_when_old for effect in effects)
+        creeps = any(effect.unsure.slow_share for effect in effects)
         said.append(
             f"most of it is the zero, which has moved since the record before{' and still creeps' * creeps}: before a "
             "scan, reset the memory and call ~/set_zero of the compensator, or close the loop"

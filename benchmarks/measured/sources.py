@@ -163,7 +163,7 @@ def tendon(files: Sequence[bytes]) -> Lines:
 
 
 def mirror(files: Sequence[bytes]) -> Lines:
-    """Read a capture of a dSPACE system: time (s), amplifier output, LVDT, whose volts fall, and amplifier input (V)."""
+    """Read a capture of a dSPACE system: time (s), amplifier output, LVDT with its sign turned, amplifier input (V)."""
     (capture,) = (value for name, value in _matlab(files[0]).items() if not name.startswith("__"))
     _, sensor, drive = (np.asarray(signal.Data, dtype=np.float64) for signal in capture.Y)
     for t, v, y in zip(np.asarray(capture.X.Data, dtype=np.float64), drive, -sensor, strict=True):

@@ -20,6 +20,7 @@ from benchmarks.measured.methods.base import (
     Prepared,
     Scale,
     Series,
+    chosen_history,
     delayed,
     invert_by_iteration,
     possible_histories,
@@ -234,13 +235,13 @@ class Problem:
     record: IntArray = field(repr=False)
 
     @classmethod
-    def of(cls, records: Sequence[Series], histories: Sequence[tuple[float, ...]], most: int) -> "Problem":
-        """Prepare records, each with the history given."""
+    def of(cls, records: Sequence[Series], most: int) -> "Problem":
+        """Prepare records, each with its history."""
         scale = Scale.of(records)
         rows = rows_of(records, most)
         prepared = tuple(
-            prepare(one.t, scale.voltage(one.v), [float(x) for x in scale.voltage(np.asarray(history, dtype=float))])
-            for one, history in zip(records, histories, strict=True)
+            prepare(one.t, scale.voltage(one.v), [float(x) for x in scale.voltage(np.asarray(one.history))])
+            for one in records
         )
         y = np.concatenate([scale.displacement(one.y[at]) for one, at in zip(records, rows, strict=True)])
         number = np.concatenate([np.full(at.size, k) for k, at in enumerate(rows)])
@@ -266,14 +267,14 @@ class Problem:
         return solve(self.columns(features, delay, lag), self.y, self.record, features.free)[2]
 
 
-def likely_histories(records: Sequence[Series]) -> list[tuple[float, ...]]:
-    """Return the history of each record with which a classical model fits best, V."""
-    possible = possible_histories(records)
-    features, chosen = Plays(count=15), []
-    for one in records:
-        costs = [Problem.of([one], [history], SEARCH_ROWS).cost(features, 0.0, 0.0) for history in possible]
-        chosen.append(possible[int(np.argmin(costs))])
-    return chosen
+def likely_history(records: Sequence[Series], one: Series) -> tuple[float, ...]:
+    """Return the history of one of the fitted records, V: chosen by the error with which a classical model fits it."""
+    v = float(one.v[np.isfinite(one.v)][0])
+    costs = [
+        Problem.of([replace(one, history=history)], SEARCH_ROWS).cost(Plays(count=15), 0.0, 0.0)
+        for history in possible_histories(records, v)
+    ]
+    return chosen_history(records, v, costs)
 
 
 @dataclass(frozen=True)
@@ -297,15 +298,14 @@ class LinearMethod:
 
     def fit(self, records: Sequence[Series]) -> LinearModel:
         """Search delay, lag and rate parameter, then solve for the weights."""
-        histories = likely_histories(records)
-        coarse = Problem.of(records, histories, SEARCH_ROWS)
+        coarse = Problem.of(records, SEARCH_ROWS)
         features, delay, lag = self.features, 0.0, 0.0
         tried = self.search or features
         if self.with_lag:
             delay, lag = search_lag(lambda d, x: coarse.cost(tried, d, x), coarse.period)
         if isinstance(features, RatePlays):
             features, delay, lag = _with_rate(features, coarse, delay, lag)
-        problem = Problem.of(records, histories, MOST_ROWS)
+        problem = Problem.of(records, MOST_ROWS)
         columns = problem.columns(features, delay, lag)
         weights, constants, _ = solve_with_ridge(columns, problem.y, problem.record, features.free)
         own = {one.name: float(c) for one, c in zip(records, constants, strict=True)}

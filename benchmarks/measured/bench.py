@@ -125,6 +125,7 @@ def main() -> int:
     for title, figure in (
         ("rms error without its mean, % of range; * best, = within its own interval of the best", "rms"),
         ("rms error with its mean, % of range", "absolute"),
+        ("rms error of the fitted records without its mean, % of range", "fitted"),
         ("rms error of the voltage of the inverse, % of range", "inverse"),
         ("processor time of the fit, s", "fit_seconds"),
         ("processor time of a sample of a free run, us", "sample_microseconds"),

@@ -152,7 +152,7 @@ def _judged(
         run, history, seconds = free_run(model, one, records)
     except SlpiError as refusal:
         return f"{type(refusal).__name__}: {refusal}"
-    judged = _split(one, records)[1]
+    judged = split(one, records)[1]
     error = (run - one.y)[judged]
     share = 100.0 / float(np.ptp(one.y[judged]))
     mean = float(np.mean(error))
@@ -172,7 +172,7 @@ def _judged(
 
 def free_run(model: Fitted, one: Series, records: Sequence[Series]) -> tuple[FloatArray, tuple[float, ...], float]:
     """Return the free run of a judged record (N,), its history, V, and the least processor time of one, s."""
-    chooses, _ = _split(one, records)
+    chooses, _ = split(one, records)
     runs, seconds = {}, []
     v = float(one.v[np.isfinite(one.v)][0])
     for history in possible_histories(records, v):
@@ -187,7 +187,7 @@ def free_run(model: Fitted, one: Series, records: Sequence[Series]) -> tuple[Flo
     return runs[chosen], chosen, min(seconds)
 
 
-def _split(one: Series, records: Sequence[Series]) -> tuple[Mask, Mask]:
+def split(one: Series, records: Sequence[Series]) -> tuple[Mask, Mask]:
     """Return the samples of a judged record that choose its history, and those that are judged."""
     judged = one.fitted & np.isfinite(one.y)
     for record in records:

@@ -113,10 +113,10 @@ def test_the_history_is_chosen_on_what_is_not_judged():
     t, v, _ = drive()
     fitted = np.arange(COUNT) < JUDGED
     record = Series("a", t, v, v, fitted)
-    chooses, judged = scores._split(replace(record, fitted=~fitted), [record])
+    chooses, judged = scores.split(replace(record, fitted=~fitted), [record])
     assert np.array_equal(chooses, fitted)
     assert np.array_equal(judged, ~fitted)
-    chooses, judged = scores._split(replace(record, name="b"), [record])
+    chooses, judged = scores.split(replace(record, name="b"), [record])
     assert np.flatnonzero(chooses).tolist() == list(range(JUDGED // 10))
     assert np.flatnonzero(judged).tolist() == list(range(JUDGED // 10, JUDGED))
 

@@ -272,7 +272,7 @@ def gru(model: GruModel, one: Series, history: History) -> FloatArray:
 
 
 def commanded(folder: Path, task: Task, span_record: str, tables: Path, kind: str, causes: bool) -> FloatArray:
-    """Return model - measured, (N,), of a model made by commands, as ``slpi verify`` has it; in the unit of the table."""
+    """Return model - measured, (N,), of a model made by commands, as ``slpi verify`` has it; unit of the table."""
 
     def run(*arguments: object) -> None:
         with redirect_stdout(StringIO()):

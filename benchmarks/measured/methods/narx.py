@@ -137,10 +137,11 @@ class NarxMethod:
 def resampled(one: Series, scale: Scale, step: float) -> Run:
     before = [float(x) for x in scale.voltage(np.asarray(one.history, dtype=np.float64))]
     prepared = prepare(one.t, scale.voltage(one.v), before)
-    grid = np.arange(prepared.t[0], prepared.t[-1], step)
+    # The last one is not before the end of the record.
+    grid = prepared.t[0] + step * np.arange(int(np.ceil((prepared.t[-1] - prepared.t[0]) / step)) + 1)
     known = np.isfinite(one.y)
     y = np.interp(grid, one.t[known], scale.displacement(one.y[known]))
-    fitted = np.interp(grid, one.t, one.fitted.astype(np.float64), left=0.0) > 0.999
+    fitted = np.interp(grid, one.t, one.fitted.astype(np.float64), left=0.0, right=0.0) > 0.999
     return Run(one.name, float(grid[0]), np.interp(grid, prepared.t, prepared.u), y, fitted)
 
 

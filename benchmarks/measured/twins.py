@@ -151,8 +151,13 @@ def columns_behind(model: LinearModel, one: Series, history: History, lags: tupl
     return columns_of(model.features)(ready.t, late(ready.t, ready.u, *lags))[ready.skipped :]
 
 
-def weights_of(columns: Sequence[FloatArray], ys: Sequence[FloatArray], free: int) -> FloatArray:
-    """Return the weights (C,), of which those after the first `free` are not negative; each record has a constant."""
+def weights_of(
+    columns: Sequence[FloatArray], ys: Sequence[FloatArray], free: int, ridges: Sequence[float]
+) -> FloatArray:
+    """Return the weights (C,), of which those after the first `free` are not negative; each record has a constant.
+
+    Of several ridges the largest within one standard error of the one that predicts fifths left out best.
+    """
     a = np.vstack([own - own.mean(axis=0) for own in columns])
     b = np.concatenate([y - y.mean() for y in ys])
     low = np.append(np.full(free, -np.inf), np.zeros(a.shape[1] - free))
@@ -162,10 +167,18 @@ def weights_of(columns: Sequence[FloatArray], ys: Sequence[FloatArray], free: in
         system = np.vstack([rows, size * np.eye(a.shape[1])])
         return np.asarray(lsq_linear(system, np.append(y, np.zeros(a.shape[1])), (low, np.inf)).x)
 
-    # The ridge that predicts the last fifth best.
-    cut, ridges = 4 * b.size // 5, (1e-7, 1e-5, 1e-3)
-    left = [float(np.std(a[cut:] @ solved(a[:cut], b[:cut], ridge) - b[cut:])) for ridge in ridges]
-    return solved(a, b, ridges[int(np.argmin(left))])
+    if len(ridges) == 1:
+        return solved(a, b, ridges[0])
+    fifth = np.arange(b.size) * 5 // b.size
+    errors = np.array(
+        [
+            [np.var(a[fifth == k] @ solved(a[fifth != k], b[fifth != k], one) - b[fifth == k]) for k in range(5)]
+            for one in ridges
+        ]
+    )
+    best = errors[int(np.argmin(errors.mean(axis=1)))]
+    as_good = errors.mean(axis=1) <= best.mean() + np.std(best, ddof=1) / np.sqrt(5.0)
+    return solved(a, b, max(one for one, good in zip(ridges, as_good, strict=True) if good))
 
 
 def linear(model: LinearModel, records: Sequence[Series], one: Series, history: History, search: bool) -> FloatArray:
@@ -174,28 +187,30 @@ def linear(model: LinearModel, records: Sequence[Series], one: Series, history: 
     thin = max(1, sum(map(len, used)) // ROWS)
     ys = [own.y[at][::thin] for own, at in zip(records, used, strict=True)]
 
-    def fit(lags: tuple[float, float]) -> tuple[FloatArray, list[FloatArray]]:
+    def fit(lags: tuple[float, float], ridges: Sequence[float]) -> tuple[FloatArray, list[FloatArray]]:
         columns = [
             columns_behind(model, own, own.history, lags)[at][::thin] for own, at in zip(records, used, strict=True)
         ]
-        return weights_of(columns, ys, getattr(model.features, "free", 0)), columns
+        return weights_of(columns, ys, getattr(model.features, "free", 0), ridges), columns
 
     lags = model.delay, model.lag
     if search:
         period = float(np.median(np.diff(records[0].t)))
 
         def cost(x: FloatArray) -> float:
-            weights, columns = fit((abs(x[0]) * period, abs(x[1]) * period))
+            weights, columns = fit((abs(x[0]) * period, abs(x[1]) * period), (1e-6,))
             errors = [y - own @ weights for y, own in zip(ys, columns, strict=True)]
             return float(np.sqrt(np.mean(np.concatenate([error - error.mean() for error in errors]) ** 2)))
 
         found = minimize(cost, (1.0, 2.0), method="Nelder-Mead", options={"maxfev": 40})
         lags = abs(found.x[0]) * period, abs(found.x[1]) * period
-    return columns_behind(model, one, history, lags) @ fit(lags)[0]
+    # Play operators have the ridges of the method, others hardly any.
+    ridges = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2) if isinstance(model.features, Plays | Creep | RatePlays) else (1e-5,)
+    return columns_behind(model, one, history, lags) @ fit(lags, ridges)[0]
 
 
 def modified(model: ModifiedModel, records: Sequence[Series], one: Series, history: History) -> FloatArray:
-    """Return the free run, (N,), of play operators behind one-sided dead zones as Kuhnen (2003) writes them."""
+    """Return the free run, (N,), of play operators behind one-sided dead zones (Kuhnen 2003), fitted together."""
     base = model.base
     used = [np.flatnonzero(own.fitted & np.isfinite(own.y)) for own in records]
     thin = max(1, sum(map(len, used)) // ROWS)
@@ -204,23 +219,22 @@ def modified(model: ModifiedModel, records: Sequence[Series], one: Series, histo
     y = np.concatenate([own.y[at][::thin] for own, at in zip(records, used, strict=True)]) / base.scale.y_range
     number = np.concatenate([np.full(len(own), k) for k, own in enumerate(columns)])
     x, thresholds, plays = np.vstack(columns), np.linspace(-0.4, 0.4, 9), columns[0].shape[1]
+    last = plays + 2 + thresholds.size
 
     def shaped(p: FloatArray, x: FloatArray) -> FloatArray:
-        inner = x @ p[:plays] + p[plays]
-        zones = np.where(
-            thresholds >= 0.0,
-            np.maximum(inner[:, None] - thresholds, 0.0),
-            np.minimum(inner[:, None] - thresholds, 0.0),
-        )
-        return np.asarray(inner + zones @ p[plays + 1 : plays + 1 + thresholds.size])
+        # The weights of the dead zones are the changes of the slopes, which stay positive.
+        inner, slopes = x @ p[:plays] + p[plays], p[plays + 1 : last]
+        zones = np.maximum(inner[:, None] - thresholds, 0.0)
+        return np.asarray(slopes[0] * inner + zones @ np.diff(slopes))
 
     def residual(p: FloatArray) -> FloatArray:
-        return np.asarray(shaped(p, x) + p[plays + 1 + thresholds.size :][number] - y)
+        return np.asarray(shaped(p, x) + p[last:][number] - y)
 
-    start = np.concatenate([weights_of(columns, [y[number == k] for k in range(len(columns))], 0), np.zeros(10)])
-    start = np.concatenate([start, [np.mean(y[number == k]) for k in range(len(columns))]])
+    ys = [y[number == k] for k in range(len(columns))]
+    ends = [float(np.mean(own)) for own in ys]
+    start = np.concatenate([weights_of(columns, ys, 0, (1e-6,)) + 1e-6, [0.0], np.ones(thresholds.size + 1), ends])
     low = np.full(start.size, -np.inf)
-    low[:plays] = -1e-9
+    low[:plays], low[plays + 1 : last] = 0.0, 0.05
     p = least_squares(residual, start, bounds=(low, np.inf), max_nfev=60, x_scale="jac").x
     return base.scale.y_range * shaped(p, columns_behind(base, one, history, lags))
 

@@ -32,7 +32,8 @@ from benchmarks.measured.methods.base import (
 IntArray = NDArray[np.int64]
 
 # Ridge on the weights, as a share of the mean square of their columns: settles weights that no sample tells apart. The
-# first is that of the searches; that of the fit is the best of all on blocks left out.
+# first is that of the searches; that of the fit predicts blocks left out best, or, for play operators, is the largest
+# within one standard error of it (Breiman et al. 1984): the weights of loops wider than the fitted ones rest on it.
 RIDGES, BLOCKS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2), 5
 
 
@@ -207,11 +208,11 @@ def solve(
 
 
 def solve_with_ridge(
-    columns: FloatArray, y: FloatArray, record: IntArray, free: int
+    columns: FloatArray, y: FloatArray, record: IntArray, free: int, *, largest: bool = False
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Return what `solve` does with the ridge that predicts blocks left out best."""
-    errors = np.zeros(len(RIDGES))
-    for left_out in np.array_split(np.arange(y.size), BLOCKS):
+    """Return what `solve` does with the ridge that predicts blocks left out best, or the `largest` as good."""
+    errors = np.zeros((len(RIDGES), BLOCKS))
+    for block, left_out in enumerate(np.array_split(np.arange(y.size), BLOCKS)):
         kept = np.ones(y.size, dtype=np.bool_)
         kept[left_out] = False
         # A block may hold a whole record: numbers without gaps.
@@ -219,8 +220,13 @@ def solve_with_ridge(
         for k, share in enumerate(RIDGES):
             weights, _, _ = solve(columns[kept], y[kept], number, free, share)
             # Without its mean, as the errors of the table.
-            errors[k] += float(np.var(columns[left_out] @ weights - y[left_out])) * left_out.size
-    return solve(columns, y, record, free, RIDGES[int(np.argmin(errors))])
+            errors[k, block] = np.var(columns[left_out] @ weights - y[left_out])
+    mean = errors.mean(axis=1)
+    chosen = int(np.argmin(mean))
+    if largest:
+        limit = mean[chosen] + float(np.std(errors[chosen], ddof=1)) / np.sqrt(BLOCKS)
+        chosen = int(np.flatnonzero(mean <= limit)[-1])
+    return solve(columns, y, record, free, RIDGES[chosen])
 
 
 @dataclass(frozen=True)
@@ -307,7 +313,9 @@ class LinearMethod:
             features, delay, lag = _with_rate(features, coarse, delay, lag)
         problem = Problem.of(records, MOST_ROWS)
         columns = problem.columns(features, delay, lag)
-        weights, constants, _ = solve_with_ridge(columns, problem.y, problem.record, features.free)
+        weights, constants, _ = solve_with_ridge(
+            columns, problem.y, problem.record, features.free, largest=isinstance(features, Plays | Creep | RatePlays)
+        )
         own = {one.name: float(c) for one, c in zip(records, constants, strict=True)}
         return LinearModel(features, problem.scale, weights, own, delay, lag)
 

@@ -247,6 +247,7 @@ bench-no-harm: build
 bench-measured: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) -m benchmarks.measured.bench --keep
 	$(VENV) -m benchmarks.measured.report
+	$(VENV) -m benchmarks.measured.loop
 
 bench-twins: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) -m benchmarks.measured.twins

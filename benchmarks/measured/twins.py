@@ -104,8 +104,7 @@ def columns_of(features: Any) -> Columns:
     radii = np.arange(getattr(features, "count", 1)) / getattr(features, "count", 1)
 
     def creep(t: FloatArray, u: FloatArray) -> FloatArray:
-        period = float(np.median(np.diff(t)))
-        slow = np.geomspace(3.0 * period, max((t[-1] - t[0]) / 2.0, 10.0 * period), features.decades)
+        slow = np.array(features.times)
         own = play(u, u, np.array(features.creeping))
         states, found = np.repeat(own[0][:, None], slow.size, axis=1), []
         for dt, x in zip(np.diff(t, prepend=t[0]), own, strict=True):

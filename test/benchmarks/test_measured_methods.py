@@ -63,7 +63,7 @@ def system(name):
         case "rate-dep. PI":
             return columns(RatePlays(0.02)) @ falling
         case "PI, creep":
-            return columns(Creep()) @ np.concatenate([falling[:25], np.full(18, 0.05)])
+            return columns(Creep()) @ np.concatenate([falling[:25], np.full(9, 0.05)])
         case "Bouc-Wen":
             return columns(BoucWen((0.7, 0.3, 0.2))) @ np.array([2.0, 0.3, 0.1, -1.0])
         case "NARX":

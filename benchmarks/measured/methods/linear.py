@@ -94,14 +94,19 @@ class Creep:
     free: int = 0
     creeping: tuple[float, ...] = (0.0, 0.15, 0.4)
     decades: int = 6
+    times: tuple[float, ...] = (0.1, 1.0, 10.0)  # s
+
+    def over(self, prepared: Sequence[Prepared]) -> "Creep":
+        """Return the method with time constants from a few samples to half of the longest record."""
+        period = min(one.period for one in prepared)
+        longest = max(float(one.t[-1] - one.t[one.skipped]) for one in prepared)
+        times = np.geomspace(3.0 * period, max(longest / 2.0, 10.0 * period), self.decades)
+        return replace(self, times=tuple(times.tolist()))
 
     def columns(self, prepared: Prepared, u: FloatArray, rows: IntArray) -> FloatArray:
-        """Return play operators, and the lags of some of them with time constants over the record's decades."""
+        """Return play operators, and the lags of some of them."""
         own = operators.plays(u, np.arange(self.count) / self.count, rows)
-        t = prepared.t
-        longest = float(t[-1] - t[prepared.skipped])
-        constants = np.geomspace(3.0 * prepared.period, max(longest / 2.0, 10.0 * prepared.period), self.decades)
-        shares = -np.expm1(-np.diff(t, prepend=t[0])[:, None] / constants)
+        shares = -np.expm1(-np.diff(prepared.t, prepend=prepared.t[0])[:, None] / np.array(self.times))
         every = np.arange(u.size)
         slow = [
             operators.relaxations(operators.plays(u, np.array([radius]), every)[:, 0], shares, rows)
@@ -311,6 +316,8 @@ class LinearMethod:
             delay, lag = search_lag(lambda d, x: coarse.cost(tried, d, x), coarse.period)
         if isinstance(features, RatePlays):
             features, delay, lag = _with_rate(features, coarse, delay, lag)
+        if isinstance(features, Creep):
+            features = features.over(coarse.prepared)
         problem = Problem.of(records, MOST_ROWS)
         columns = problem.columns(features, delay, lag)
         weights, constants, _ = solve_with_ridge(

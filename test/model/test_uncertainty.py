@@ -137,6 +137,24 @@ def test_the_memory_is_known_after_a_reset_and_after_the_whole_range():
     )
 
 
+@pytest.mark.parametrize("name", ["memory", "law", "creep"])
+def test_what_the_path_has_not_passed_alone_is_remembered(name):
+    axis = replace(AXES[name], end=AXES["memory"].end)
+    v = np.concatenate([np.linspace(a, b, 500) for a, b in [(40.0, 99.9), (99.9, 0.1), (0.1, 60.0)]])
+    t = np.arange(v.size) * 0.1
+    memory = AxisUncertainty(axis).budget(t, np.full(v.size, 5e-6), v).memory
+    relaxed = AxisUncertainty(axis, known_memory=True).budget(t, np.full(v.size, 5e-6), v).memory
+    assert memory[0] > 0.1e-6 and (memory >= relaxed).all()
+    assert memory[600] < 0.03 * memory[0] + relaxed[600] and memory[-1] < 1e-9 + relaxed[-1] < 3e-9
+
+
+def test_a_voltage_that_the_hysteresis_does_not_feel_has_passed_nothing():
+    axis = replace(AXES["law"], effects=(RateDependence(4.0, 0.1),), end=AXES["memory"].end)
+    v = np.array([40.0, 100.0, 0.0, 50.0])
+    quick, slow = (AxisUncertainty(axis).budget(np.arange(4) * dt, np.full(4, 5e-6), v).memory for dt in (1e-2, 1e5))
+    assert slow[-1] < 1e-12 and quick[-1] > 20e-9
+
+
 def test_the_age_grows_as_a_random_walk_and_creep_as_its_logarithm():
     t = [0.0, 30.0, 90.0]
     one = budget(BARE, t, [5e-6] * 3, [40.0] * 3)

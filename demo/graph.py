@@ -31,12 +31,17 @@ EXECUTABLES = (
 
 
 @contextmanager
-def executable(name: str, *, log: str = "warn", **parameters: str | float | bool) -> Iterator[subprocess.Popen[bytes]]:
-    """Run one of the package's nodes until the block ends; it gets the time to finish its work."""
+def executable(
+    name: str, *, log: str = "warn", listen: bool = False, **parameters: str | float | bool
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Run one of the package's nodes until the block ends; it gets the time to finish its work.
+
+    With `listen` its log is at ``stderr`` of the process, to be read to the end.
+    """
     command = [str(EXECUTABLES / name), "--ros-args", "--log-level", log]
     for key, value in parameters.items():
         command += ["-p", f"{key}:={value}"]
-    process = subprocess.Popen(command, start_new_session=True)
+    process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE if listen else None)
     try:
         yield process
     finally:

@@ -26,6 +26,7 @@ keep_to_own_domain()
 import numpy as np  # noqa: E402
 import plots  # noqa: E402
 from graph import EXECUTABLES, FloatArray, Operator, executable, operator  # noqa: E402
+from promise import asked_early, best_of, kept  # noqa: E402
 
 import slpi_ros  # noqa: E402
 from benchmarks.paths import scan_path  # noqa: E402
@@ -39,9 +40,6 @@ V_MIN, V_MAX, SLEW = 0.0, 100.0, 1000.0
 SPEED = 4.0
 NOISE = 8e-9
 KINDS = {"pi": "classical PI", "slpi": "SLPI"}
-CAUSES = "SLPI with causes"
-# The demo's error agrees with that of the calibration within this factor.
-FACTOR = 1.5
 
 
 def wipe(stage: Operator) -> float:
@@ -92,18 +90,9 @@ def follow_compensated(stage: Operator, name: str, model: Path, t: FloatArray, y
         # To the begin of the path without a jump, from where the reset has left the stage.
         at = float(stage.state.position[0])
         approach = at + (y[0] - at) * (1 - np.cos(np.linspace(0.0, np.pi, int(RATE)))) / 2
-        asked = asked_early(np.concatenate([approach, y]), slpi_ros.load_model(model).axes["x"].chain.delay)
+        asked = asked_early(np.concatenate([approach, y]), slpi_ros.load_model(model).axes["x"].chain.delay, RATE)
         measured = stage.follow(asked.tolist(), RATE)[-y.size :, 1]
-        return plots.Run(name, t, y, measured, stage.held_at_limit() / y.size)
-
-
-def asked_early(y: FloatArray, delay: float) -> FloatArray:
-    """Return the setpoints, shape (N,), m, with which a stage with a `delay` (s) reaches `y`, shape (N,), m, in time.
-
-    Single setpoints come too late for a compensator to undo a delay; of a trajectory it does this by itself.
-    """
-    at = np.arange(y.size) / RATE
-    return np.interp(at + delay, at, y)
+        return plots.Run(name, t, y, measured, stage.held_at_limit() / y.size, stage.late / asked.size)
 
 
 def compared(seed: int, models: Mapping[str, Path], stroke: tuple[float, float], duration: float) -> list[plots.Run]:
@@ -127,35 +116,6 @@ def table_of(runs: Sequence[plots.Run], stroke: float) -> list[list[str]]:
         shares = (f"{x / stroke:.3%}" for x in (rest.mean(), rest.max()))
         rows.append([run.name, f"{mean * 1e6:.3f} µm", f"{mean / stroke:.3%}", f"{constant * 1e6:+.3f} µm", *shares])
     return rows
-
-
-def best_of(runs: Sequence[plots.Run]) -> int:
-    """Return the number of the run with the smallest mean error."""
-    return int(np.argmin([np.abs(run.error).mean() for run in runs]))
-
-
-def kept(promised: float, runs: Sequence[plots.Run]) -> str:
-    """Return a sentence about the promised mean error (m) and that of the demo; where they differ, about the reason."""
-    run = runs[-1]
-    mean = float(np.abs(run.error).mean())
-    said = f" The calibrator promised a mean error of {promised * 1e9:.1f} nm; here it is {mean * 1e9:.1f} nm"
-    best = runs[best_of(runs)]
-    if best is not run:
-        said += f", and {np.abs(best.error).mean() * 1e9:.1f} nm with {best.name}"
-    if promised / FACTOR <= mean <= promised * FACTOR and best is run:
-        return f"{said}."
-    # What has changed since the calibration, by what it would leave of the error.
-    causes = {
-        "the zero, which is off by {:.1f} nm": (np.ones_like(run.t), 1e9),
-        "the time, by which the stage is {:.2f} ms late": (-np.gradient(run.desired, run.t), 1e3),
-        "the sensitivity, which is off by {:.3f} %": (run.desired - run.desired.mean(), 1e2),
-    }
-    left = {}
-    for name, (column, unit) in causes.items():
-        size = float(column @ run.error / (column @ column))
-        left[name.format(size * unit)] = float(np.abs(run.error - size * column).mean())
-    name = min(left, key=left.__getitem__)
-    return f"{said}. Most of the difference goes with {name}: without it {left[name] * 1e9:.1f} nm are left."
 
 
 HEADER = ["path not in the records", "mean error", "of stroke", "offset", "without offset, mean", "maximum"]
@@ -221,7 +181,7 @@ def main() -> int:
         models = {name: Path(work) / f"{kind}.json" for kind, name in KINDS.items()}
         for kind, name in KINDS.items():
             identify(bag, models[name], kind)
-        models[CAUSES] = calibration / "model.json"
+        models["SLPI with causes"] = calibration / "model.json"
         model = slpi_ros.load_model(calibration / "model.json")
         low, high = model.axes["x"].displacement_range
         print(f"following a new path of {options.path:g} s, {1 + len(models)} times", flush=True)

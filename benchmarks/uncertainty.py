@@ -3,16 +3,16 @@
 Simulated stages, every other one of them of the foreign physics of ``hidden/foreign.py``, the others Preisach stages
 with random effects: 30 s of calibration with 8 nm of noise give a model, identified and diagnosed. Then the stage is
 driven by the model along random paths, without feedback, at the horizons 1 s, 1 min and 1 h, in two ways: after a reset
-at the end of the record, and after moves to some voltage of which the model knows this voltage alone. The error is where
-the stage is minus the desired displacement, its offset included, without noise.
+at the end of the record, and after moves of which the model knows the last voltage alone. The error is where the stage
+is minus the desired displacement, its offset included, without noise.
 
 Measured records: a loop family is identified from all records of an actuator but one, or from the first half of a
 single one, and simulated along the other. The error is that without the constant offset of the record, whose zero is
 arbitrary, and the noise of the sensor counts to its uncertainty. SLPI_MEASURED_DATA gives the folder.
 
-Any wide promise covers the errors. So the ratio of the median uncertainty to the rms of the true error is told, too: of
-each path, and of all paths of a stage together. The exit code is 1 if less than 90 or more than 99.5 % of the samples of
-the simulated stages are within two uncertainties, or if more than one stage in ten has a ratio above 4.
+Any wide promise covers the errors. So the ratio of the median uncertainty to the rms of the true error is told, too:
+of each path, and of all paths of a stage together. The exit code is 1 if less than 90 or more than 99.5 % of the
+samples of the simulated stages are within two uncertainties, or if more than one stage in ten has a ratio above 4.
 """
 
 # To be set before NumPy is imported: the processes share the cores.
@@ -194,28 +194,8 @@ def against(axis: slpi_ros.AxisModel, record: Record) -> tuple[FloatArray, float
     return np.stack([error, u]), float(np.sqrt(np.mean(error**2))) / stroke
 
 
-def main() -> int:
-    """Run the benchmark."""
-    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--stages", type=int, default=10, help="simulated stages")
-    parser.add_argument("--first", type=int, default=0, help="number of the first one")
-    parser.add_argument("--without-measured", action="store_true", help="simulated stages only")
-    parser.add_argument("--processes", type=int, default=2)
-    options = parser.parse_args()
-    found: dict[str, list[FloatArray]] = defaultdict(list)
-    stages: list[FloatArray] = []
-    columns = [f"{start} {horizon}" for start in STARTS.values() for horizon in HORIZONS]
-    print(f"share within 2 u, and median u / rms error\n{'':82}{'all':>11} " + " ".join(f"{one:>18}" for one in columns))
-    with get_context("spawn").Pool(options.processes) as pool:
-        numbers = range(options.first, options.first + options.stages)
-        for line, judged in pool.imap(judge, numbers, chunksize=1):
-            print(line, flush=True)
-            stages.append(np.hstack(list(judged.values())))
-            for column, own in judged.items():
-                found[column].append(own)
-    if not options.without_measured:
-        print("measured records, not fitted")
-        measured(found)
+def summary(found: dict[str, list[FloatArray]], stages: list[FloatArray]) -> int:
+    """Print a row for each of the columns `found`, and for all paths of each of the `stages`; return the exit code."""
     for horizon in HORIZONS if stages else ():
         found[f"all {horizon}"] = [each for start in STARTS.values() for each in found[f"{start} {horizon}"]]
     if stages:
@@ -230,6 +210,33 @@ def main() -> int:
     if not stages:
         return 0
     return 0 if LOWEST <= share <= HIGHEST and np.mean(ratios <= SHARP) >= MOST else 1
+
+
+def main() -> int:
+    """Run the benchmark."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--stages", type=int, default=10, help="simulated stages")
+    parser.add_argument("--first", type=int, default=0, help="number of the first one")
+    parser.add_argument("--without-measured", action="store_true", help="simulated stages only")
+    parser.add_argument("--processes", type=int, default=2)
+    options = parser.parse_args()
+    found: dict[str, list[FloatArray]] = defaultdict(list)
+    stages: list[FloatArray] = []
+    columns = [f"{start} {horizon}" for start in STARTS.values() for horizon in HORIZONS]
+    print(
+        f"share within 2 u, and median u / rms error\n{'':82}{'all':>11} " + " ".join(f"{one:>18}" for one in columns)
+    )
+    with get_context("spawn").Pool(options.processes) as pool:
+        numbers = range(options.first, options.first + options.stages)
+        for line, judged in pool.imap(judge, numbers, chunksize=1):
+            print(line, flush=True)
+            stages.append(np.hstack(list(judged.values())))
+            for column, own in judged.items():
+                found[column].append(own)
+    if not options.without_measured:
+        print("measured records, not fitted")
+        measured(found)
+    return summary(found, stages)
 
 
 if __name__ == "__main__":

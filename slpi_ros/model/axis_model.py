@@ -409,6 +409,12 @@ class AxisModel:
         (low, high), (lowest, highest) = self.voltage_range, self.chain.clipped
         return max(low, lowest), min(high, highest)
 
+    @cached_property
+    def felt_range(self) -> tuple[float, float]:
+        """Voltage range (V) that the hysteresis has felt: an effect around it may have kept it from the limits."""
+        (low, high), turns = self.hysteresis_range, self.end.history if self.end and self.chain.around else ()
+        return max(low, min(turns, default=low)), min(high, max(turns, default=high))
+
     def _allowed(self, limits: Limits | None) -> Limits:
         return (limits or Limits(-inf, inf)).within(self.voltage_range)
 

@@ -73,9 +73,17 @@ class AxisUncertainty:
         Assumed initial state, as for `StageModel.compensate`.
     known_memory : bool, optional
         Whether this state is known. By default only that after ``wiped``: otherwise the stage may have moved since.
+    felt : (float, float), volts, optional
+        Voltage range that the hysteresis may have felt before. By default that of the record.
     """
 
-    def __init__(self, axis: AxisModel, start_memory: StartMemory = "end", known_memory: bool | None = None) -> None:
+    def __init__(
+        self,
+        axis: AxisModel,
+        start_memory: StartMemory = "end",
+        known_memory: bool | None = None,
+        felt: tuple[float, float] | None = None,
+    ) -> None:
         quality = axis.quality
         if quality.regions is None or quality.drift is None or quality.duration is None or quality.fastest is None:
             raise ModelError(
@@ -87,7 +95,7 @@ class AxisUncertainty:
                 f"the uncertainty of kind '{axis.kind}' is not known, as it needs the complete path in advance; "
                 "identify kind 'slpi'"
             )
-        self._axis, self._start_memory = axis, start_memory
+        self._axis, self._start_memory, self._felt = axis, start_memory, felt or axis.felt_range
         self.known_memory = start_memory == "wiped" if known_memory is None else known_memory
         self.low, high = axis.displacement_range
         self.stroke = high - self.low
@@ -204,7 +212,7 @@ class AxisUncertainty:
 
     def unknown_memory(self) -> UnknownMemory | None:
         """Return how the unknown memory is forgotten from the initial state on; None if the memory is known."""
-        return None if self.known_memory else UnknownMemory(self._axis, self._start_memory)
+        return None if self.known_memory else UnknownMemory(self._axis, self._start_memory, self._felt)
 
     def _relaxing_square(self, since: FloatArray) -> FloatArray:
         """Return the square (m^2) of what still relaxes after the moves before the start, or those of the reset."""

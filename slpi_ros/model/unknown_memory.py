@@ -1,8 +1,8 @@
 """The memory of the hysteresis at the start as a source of uncertainty: as long as it is remembered.
 
-Whatever went before, the state at the start lies between those after a fall and after a rise over the whole range.
-These two are followed beside the assumed one. Each reversal that the path wipes out is one that they had not in common,
-and once all are wiped out, the three agree.
+Whatever went before, the state at the start lies between those after a fall and after a rise over the whole range that
+the hysteresis has felt. These two are followed beside the assumed one. Each reversal that the path wipes out is one
+that they had not in common, and once all are wiped out, the three agree.
 """
 
 from dataclasses import replace
@@ -20,8 +20,8 @@ class UnknownMemory:
     """Square of the uncertainty (m^2) from a memory that is not known, along a path or sample by sample."""
 
     # A lag or a rate limit before the hysteresis is ignored: it hardly changes the reversals.
-    def __init__(self, axis: AxisModel, start_memory: StartMemory) -> None:
-        low, high = axis.hysteresis_range
+    def __init__(self, axis: AxisModel, start_memory: StartMemory, felt: tuple[float, float]) -> None:
+        low, high = felt
         self._clipped, self._around = axis.chain.clipped, axis.chain.around
         self.start = start = min(max(axis.initial(start_memory).voltage, low), high)
         assumed = axis.memory(start_memory)

@@ -57,7 +57,7 @@ def describe_uncertainty(axis: AxisModel, *, details: bool = True) -> list[str]:
 
 def unknown_memory(axis: AxisModel) -> float:
     """Return the standard uncertainty (m) from a memory that is not known, before anything moves."""
-    unknown = UnknownMemory(axis, "end")
+    unknown = UnknownMemory(axis, "end", axis.felt_range)
     return sqrt(unknown.step(0.0, unknown.start))
 
 

@@ -11,6 +11,7 @@ from model.test_surroundings import LOAD, WARM
 from strategies import FAMILY_CASE, axis_model, two_axes
 
 import slpi_ros
+from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.effects.rate_dependence import RateDependence
@@ -153,6 +154,17 @@ def test_a_voltage_that_the_hysteresis_does_not_feel_has_passed_nothing():
     v = np.array([40.0, 100.0, 0.0, 50.0])
     quick, slow = (AxisUncertainty(axis).budget(np.arange(4) * dt, np.full(4, 5e-6), v).memory for dt in (1e-2, 1e5))
     assert slow[-1] < 1e-12 and quick[-1] > 20e-9
+
+
+def test_after_the_range_that_the_records_have_felt_nothing_is_unknown():
+    """A rate law keeps the hysteresis from the limits, in the record and in use."""
+    law = replace(AXES["law"], effects=(RateDependence(4.0, 0.1),))
+    loops = 50.0 - 50.0 * np.cos(np.arange(400) * 0.05 * np.pi)
+    u = law.effects[0].apply(loops, EffectContext.since_start(np.arange(400) * 1e-2))
+    axis = replace(law, end=law.after(np.append(u, 40.0)))
+    v = np.concatenate([[40.0], loops[10:]])
+    memory = AxisUncertainty(axis).budget(np.arange(v.size) * 1e-2, np.full(v.size, 5e-6), v).memory
+    assert memory[0] > 0.1e-6 and memory[-1] < 0.01 * memory[0]
 
 
 def test_the_age_grows_as_a_random_walk_and_creep_as_its_logarithm():

@@ -1,22 +1,12 @@
-"""The promise of the calibrator in the demo: setpoints along a path, the best run, and why promise and run differ."""
+"""The promise of the calibrator in the demo: the best run, and why promise and run differ."""
 
 from collections.abc import Sequence
 
 import numpy as np
 import plots
-from plots import FloatArray
 
 # The error of the demo agrees with that of the calibration within this factor.
 FACTOR = 1.5
-
-
-def asked_early(y: FloatArray, delay: float, rate: float) -> FloatArray:
-    """Return setpoints, shape (N,), m, at a `rate` (Hz), with which a stage with a `delay` (s) is at `y` (m) in time.
-
-    Single setpoints come too late for a compensator to undo a delay; of a trajectory it does this by itself.
-    """
-    at = np.arange(y.size) / rate
-    return np.interp(at + delay, at, y)
 
 
 def best_of(runs: Sequence[plots.Run]) -> int:

@@ -26,7 +26,7 @@ keep_to_own_domain()
 import numpy as np  # noqa: E402
 import plots  # noqa: E402
 from graph import EXECUTABLES, FloatArray, Operator, executable, operator  # noqa: E402
-from promise import asked_early, best_of, kept  # noqa: E402
+from promise import best_of, kept  # noqa: E402
 
 import slpi_ros  # noqa: E402
 from benchmarks.paths import scan_path  # noqa: E402
@@ -84,13 +84,18 @@ def follow_uncompensated(stage: Operator, t: FloatArray, y: FloatArray, low: flo
 
 def follow_compensated(stage: Operator, name: str, model: Path, t: FloatArray, y: FloatArray) -> plots.Run:
     """Follow a path with the compensator in between."""
-    with executable("compensator", log="error", model_file=str(model), voltage_min=V_MIN, voltage_max=V_MAX):
+    read = {"measured_displacement": "stage_state"}
+    given = {"model_file": str(model), "voltage_min": V_MIN, "voltage_max": V_MAX}
+    with executable("compensator", log="error", remap=read, **given):
         stage.await_compensator()
-        stage.reset("/compensator")
+        # As the calibrator begins its verification.
+        stage.call("/compensator/reset_memory")
+        stage.call("/compensator/set_zero")
         # To the begin of the path without a jump, from where the reset has left the stage.
         at = float(stage.state.position[0])
         approach = at + (y[0] - at) * (1 - np.cos(np.linspace(0.0, np.pi, int(RATE)))) / 2
-        asked = asked_early(np.concatenate([approach, y]), slpi_ros.load_model(model).axes["x"].chain.delay, RATE)
+        path = np.concatenate([approach, y])
+        asked = slpi_ros.load_model(model).axes["x"].in_advance(np.arange(path.size) / RATE, path)
         measured = stage.follow(asked.tolist(), RATE)[-y.size :, 1]
         return plots.Run(name, t, y, measured, stage.held_at_limit() / y.size, stage.late / asked.size)
 

@@ -335,7 +335,7 @@ class _Calibration:
         if shown:
             model = with_present_zero(model, self._records)
             path = replace(settings, path=showing(settings, model))
-            drive, desired = compensated(path, model, len(self._steps), self._records)
+            drive, desired = compensated(path, model, len(self._steps), self._records, in_advance=False)
             recording = self._recorded(LOOP_DRIVE, drive, desired, loops_of(found, model))
             for name, one in shown.items():
                 error = tracking_error(recording, name, model, settings.goal(self._repeatability[name]))
@@ -511,7 +511,7 @@ def why(verified: Sequence[Mapping[str, TrackingError]], diagnosis: Diagnosis, e
     if lasting:
         said.append(f"{', '.join(lasting)} cannot be undone without feedback and will go on")
     if late := sum(effect.shift for effect in effects):
-        # The path of the verification is known in advance.
+        # On the path of the verification it is undone.
         said.append(f"the delay of {late * 1e3:.3g} ms is undone on a trajectory, and not by setpoints one by one")
     if abs(worst.offset) > worst.rest:
         creeps = any(effect.resembles_when_old for effect in effects)

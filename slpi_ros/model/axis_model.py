@@ -319,6 +319,13 @@ class AxisModel:
         self.require_reachable(y)
         return self.command(t, y, limits, start_memory)
 
+    def in_advance(self, t: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the setpoints, shape (N,), m, at times `t` (s) with which the stage is at `y`, shape (N,), m, in time.
+
+        Setpoints one by one come too late for the inverse to undo a delay, so that they are asked for early.
+        """
+        return np.interp(t + self.chain.delay, t, y)
+
     def require_reachable(self, y: FloatArray) -> None:
         """Raise an error, as `compensate`, unless `y`, (N,), metres, is finite and in the identified range."""
         require_finite(y)

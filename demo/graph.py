@@ -6,7 +6,7 @@ import subprocess
 import threading
 import time
 from array import array
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -32,12 +32,7 @@ EXECUTABLES = (
 
 @contextmanager
 def executable(
-    name: str,
-    *,
-    log: str = "warn",
-    listen: bool = False,
-    remap: Mapping[str, str] | None = None,
-    **parameters: str | float | bool,
+    name: str, *, log: str = "warn", listen: bool = False, **parameters: str | float | bool
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Run one of the package's nodes until the block ends; it gets the time to finish its work.
 
@@ -46,8 +41,6 @@ def executable(
     command = [str(EXECUTABLES / name), "--ros-args", "--log-level", log]
     for key, value in parameters.items():
         command += ["-p", f"{key}:={value}"]
-    for topic, other in (remap or {}).items():
-        command += ["-r", f"{topic}:={other}"]
     process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE if listen else None)
     try:
         yield process
@@ -109,12 +102,12 @@ class Operator(Node):
                 raise SystemExit(f"demo: {what} did not happen within {timeout:g} s")
             time.sleep(poll)
 
-    def call(self, service: str) -> None:
-        """Let a compensator reset the memory of the stage, or set the zero."""
-        client = self.create_client(Trigger, service)
-        self.wait_until(f"the service {service}", client.service_is_ready)
+    def reset(self, compensator: str) -> None:
+        """Let a compensator sweep the stage, so that the memory is known."""
+        client = self.create_client(Trigger, f"{compensator}/reset_memory")
+        self.wait_until(f"the service of {compensator}", client.service_is_ready)
         answer = client.call_async(Trigger.Request())
-        self.wait_until(f"the answer of {service}", answer.done)
+        self.wait_until("the reset of the memory", answer.done)
         if not answer.result().success:
             raise SystemExit(f"demo: {answer.result().message}")
 

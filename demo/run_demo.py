@@ -84,13 +84,9 @@ def follow_uncompensated(stage: Operator, t: FloatArray, y: FloatArray, low: flo
 
 def follow_compensated(stage: Operator, name: str, model: Path, t: FloatArray, y: FloatArray) -> plots.Run:
     """Follow a path with the compensator in between."""
-    read = {"measured_displacement": "stage_state"}
-    given = {"model_file": str(model), "voltage_min": V_MIN, "voltage_max": V_MAX}
-    with executable("compensator", log="error", remap=read, **given):
+    with executable("compensator", log="error", model_file=str(model), voltage_min=V_MIN, voltage_max=V_MAX):
         stage.await_compensator()
-        # As the calibrator begins its verification.
-        stage.call("/compensator/reset_memory")
-        stage.call("/compensator/set_zero")
+        stage.reset("/compensator")
         # To the begin of the path without a jump, from where the reset has left the stage.
         at = float(stage.state.position[0])
         approach = at + (y[0] - at) * (1 - np.cos(np.linspace(0.0, np.pi, int(RATE)))) / 2

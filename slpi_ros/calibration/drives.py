@@ -125,7 +125,7 @@ def compensated(
     rows = np.empty((longest, len(paths)))
     asked = paths
     if in_advance:
-        times = np.arange(longest) * dt
+        times = np.arange(longest, dtype=np.float64) * dt
         asked = [model.axis(name).in_advance(times, path) for name, path in zip(settings.axes, paths, strict=True)]
     for index, desired in enumerate(np.column_stack(asked).tolist()):
         stamp = FIRST_STAMP + round((index + 1) * dt * SECOND_NS)

@@ -93,7 +93,7 @@ help:
 	@echo 'make bench-confusion   effects, pairs, clean stages and causes that no effect describes: wrong or silent; an hour'
 	@echo 'make bench-calibrator  the calibrator on 20 hidden stages, and 30 faults; an hour'
 	@echo 'make bench-promise     the error that the calibrator promises on 20 stages, and that of scans later; half an hour'
-	@echo 'make bench-coverage   true errors within two standard uncertainties, by horizon; COVERAGE="--stages 100"; 20 minutes'
+	@echo 'make bench-coverage   true errors within two standard uncertainties, and how large these are, by horizon; COVERAGE="--stages 100"; 20 minutes'
 	@echo 'make bench-fleet    300 bags of 30 stages on Dask: changes found, one worker beside two, 20 minutes'
 	@echo 'make bench-export   the exported C inverse beside the stream of Python: agreement, time, memory; a few minutes'
 	@echo 'make test-export-arm  the exported C inverse on simulated Cortex-M4F and M7; as root it installs the tools (apt, 1 GB)'

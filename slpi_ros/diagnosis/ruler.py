@@ -76,16 +76,17 @@ def _p_value(gain: float, deviation: float, series: FloatArray) -> float:
     return float(stdtr(max(series.size / row - 1.0, 1.0), -gain / (deviation * np.sqrt(row))))
 
 
-def independent_trials(before: Loss, tried: Sequence[Loss]) -> float:
+def independent_trials(before: FloatArray, tried: Sequence[FloatArray]) -> float:
     """Return the number of independent sets whose best gain is by chance as large as that of those `tried`.
 
-    From the maximum over all sets for random signs of the blocks: Westfall and Young, Resampling-Based Multiple
-    Testing, Wiley 1993, Sec. 2.6.
+    `before` and `tried` are sums of squares of blocks, shape (blocks,), without them and with each. From the maximum
+    over all sets for random signs of the blocks: Westfall and Young, Resampling-Based Multiple Testing, Wiley 1993,
+    Sec. 2.6.
     """
     if not tried:
         return 1.0
-    parts = np.array_split(np.arange(before.blocks.size), min(SIGNED_BLOCKS, before.blocks.size))
-    gains = np.array([[float(np.sum((before.blocks - after.blocks)[own])) for own in parts] for after in tried])
+    parts = np.array_split(np.arange(before.size), min(SIGNED_BLOCKS, before.size))
+    gains = np.array([[float(np.sum((before - after)[own])) for own in parts] for after in tried])
     largest, count = np.abs(gains).max(axis=1), len(parts)
     usable = (largest > 0.0) & np.isfinite(largest)
     gains = gains[usable] / largest[usable, None]

@@ -13,7 +13,7 @@ from slpi_ros.diagnosis.effect_parameters import EachRecord, free
 from slpi_ros.diagnosis.held_out import RIDGE, HeldOut, Loss
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import drive_frequency, excited_frequency
-from slpi_ros.diagnosis.ruler import EXPLAINED, beats, chance, independent_trials, share
+from slpi_ros.diagnosis.ruler import EXPLAINED, LEAST, beats, chance, independent_trials, share
 from slpi_ros.diagnosis.structures import STRUCTURES
 from slpi_ros.effects.base import Candidate, Effect, FitContext, is_course
 from slpi_ros.effects.registry import EFFECTS
@@ -27,7 +27,7 @@ PLACES = ((1, 4), (2, 2), (3, 1))
 # Gauss-Newton steps of a set, and of the best one.
 STEPS, CONVERGED = 5, 15
 # Largest number of rounds, each with columns at new parameters.
-MOST_ROUNDS = 8
+MOST_ROUNDS = 6
 
 
 def is_own(effect: Effect | type[Any]) -> bool:
@@ -113,7 +113,8 @@ class Choice:
 
     removed: frozenset[str]
     forms: tuple[Form, ...]
-    loss: Loss
+    square: float  # m^2, mean
+    blocks: FloatArray  # m^2, sums over blocks
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -148,6 +149,7 @@ class Library:
         size[: own.shape[1]] = 1.0
         self._size = np.where(size > 0.0, size, 1.0)
         self.held_out: HeldOut = now.joint.held_out(at / self._size)
+        self._known: dict[tuple[frozenset[str], frozenset[Form]], Choice] = {}
 
     def _candidates(
         self, structures: Collection[str], names: Collection[str] | None
@@ -173,11 +175,15 @@ class Library:
         target = [0, *(self._own[name][0] for name in removed)]
         return target, [*self._beside, *(place for _, places in kept for place in places)]
 
-    def loss(self, removed: Collection[str], forms: Sequence[Form]) -> Loss:
-        """Return what is left to first order."""
-        target, kept = self.base(removed)
-        chosen = [*kept, *(place for form in forms for place in form.places)]
-        return self.held_out.loss(target, chosen, {place for form in forms for place in form.positive})
+    def choice(self, removed: frozenset[str], forms: tuple[Form, ...]) -> Choice:
+        """Return a set with what is left to first order."""
+        key = removed, frozenset(forms)
+        if key not in self._known:
+            target, kept = self.base(removed)
+            chosen = [*kept, *(place for form in forms for place in form.places)]
+            loss = self.held_out.loss(target, chosen, {place for form in forms for place in form.positive})
+            self._known[key] = Choice(removed, forms, loss.square, loss.blocks)
+        return self._known[key]
 
     def ban(self, forms: Sequence[Form]) -> None:
         """Leave out forms that have shown to mean nothing."""
@@ -220,7 +226,7 @@ class Library:
         found: dict[tuple[Any, ...], Choice] = {}
         for removed in (frozenset[str](), *(frozenset({name}) for name in present if name not in fixed)):
             once = {name for name, effect in present.items() if name not in removed and effect.joined(effect) is None}
-            begun = Choice(removed, (), self.loss(removed, ()))
+            begun = self.choice(removed, ())
             if removed:
                 found[removed, ()] = begun
             beam = [begun]
@@ -230,16 +236,13 @@ class Library:
                     if len(present) - len(removed) + len(choice.forms) >= MOST_EFFECTS + len(fixed):
                         continue
                     for form in self.screened(removed, choice.forms, once)[:screened]:
-                        forms = (*choice.forms, form)
-                        one = Choice(removed, forms, self.loss(removed, forms))
-                        if one.names not in grown or one.loss.square < grown[one.names].loss.square:
+                        one = self.choice(removed, (*choice.forms, form))
+                        if one.names not in grown or one.square < grown[one.names].square:
                             grown[one.names] = one
                 found.update({(removed, names): one for names, one in grown.items()})
-                least = min(choice.loss.square for choice in beam)
-                beam = sorted(
-                    (one for one in grown.values() if one.loss.square < least), key=lambda one: one.loss.square
-                )[:WIDTH]
-        return sorted(found.values(), key=lambda one: one.loss.square)
+                least = min(choice.square for choice in beam)
+                beam = sorted((one for one in grown.values() if one.square < least), key=lambda one: one.square)[:WIDTH]
+        return sorted(found.values(), key=lambda one: one.square)
 
     def fit(self, choice: Choice) -> Explanation | Form:
         """Return the joint fit with a choice at first parameters, or the form of it that is not admissible."""
@@ -331,7 +334,7 @@ class Search:
             library = Library(now, structures, self.names)
             best, best_structures = now, structures
             choices = library.choices(self.fixed)
-            self.trials = max(self.trials, independent_trials(now.held_out, [one.loss for one in choices]))
+            self.trials = max(self.trials, independent_trials(now.held_out.blocks, [one.blocks for one in choices]))
             tried: set[tuple[Any, ...]] = set()
             for _ in range(MOST_TRIED):
                 choice = next(
@@ -371,7 +374,8 @@ class Search:
 
     def worth_fitting(self, choices: Sequence[Choice], now: Explanation) -> list[Choice]:
         """Return the choices with the least error of each number of forms, few forms first."""
-        better = [one for one in choices if one.forms and one.loss.square < now.held_out.square]
+        most = now.held_out.square - (LEAST * now.noise) ** 2
+        better = [one for one in choices if one.forms and one.square < most]
         return [one for count, most in PLACES for one in [each for each in better if len(each.forms) == count][:most]]
 
 
@@ -491,17 +495,17 @@ class Judge:
                 size = free(now.effect(name)).size
                 present = {effect.name for effect in rest.effects}
                 singles = [form for form in library.screened((), (), present | {name}) if form.numbers <= size]
-                tried = sorted(((library.loss((), [form]), form) for form in singles), key=lambda pair: pair[0].square)
+                tried = sorted((library.choice(frozenset(), (form,)) for form in singles), key=lambda one: one.square)
                 found: list[tuple[Explanation, str]] = []
-                for loss, form in tried[:4]:
-                    if loss.square >= rest.held_out.square:
+                for choice in tried[:4]:
+                    if choice.square >= rest.held_out.square:
                         continue
-                    first = library.fit(Choice(frozenset(), (form,), loss))
+                    first = library.fit(choice)
                     if isinstance(first, Form):
                         continue
                     fit, nonsense = self.search.plausible(first.refined(CONVERGED))
                     if not nonsense and self.numbers(fit) <= self.numbers(now):
-                        found.append((fit, form.name))
+                        found.append((fit, choice.forms[0].name))
                 found.sort(key=lambda pair: pair[0].held_out.square)
                 rivals[name] = [(other, fit.held_out.rms, not self.beats(now, fit)) for fit, other in found]
                 if found and found[0][0].held_out.square < 0.999 * now.held_out.square:

@@ -27,6 +27,7 @@ class Loss:
     """Errors of one joint fit on data left out."""
 
     errors: FloatArray  # (n,), m, record by record in time order
+    sample: IntArray  # (n,), the sample of each, ascending
     record: IntArray  # (n,), the record of each
     count: int  # number of records
 
@@ -39,6 +40,13 @@ class Loss:
     def rms(self) -> float:
         """Rms error, metres."""
         return float(np.sqrt(self.square))
+
+    def beside(self, other: "Loss") -> tuple[FloatArray, FloatArray]:
+        """Return the errors of both at the samples that both have, shape (n,) each."""
+        if np.array_equal(self.sample, other.sample):
+            return self.errors, other.errors
+        _, own, its = np.intersect1d(self.sample, other.sample, assume_unique=True, return_indices=True)
+        return self.errors[own], other.errors[its]
 
     @property
     def blocks(self) -> FloatArray:
@@ -106,11 +114,18 @@ class HeldOut:
     """Errors of columns on data left out."""
 
     # `divisions` and `whole`, the products of the columns, shape (K, K), the hysteresis eliminated, are in units of
-    # the square of `unit` (m). `records` (n,) is the record of each judged sample.
+    # the square of `unit` (m). `samples` and `records`, (n,), are of each judged sample.
     def __init__(
-        self, divisions: Sequence[Division], whole: FloatArray, records: IntArray, count: int, unit: float
+        self,
+        divisions: Sequence[Division],
+        whole: FloatArray,
+        samples: IntArray,
+        records: IntArray,
+        count: int,
+        unit: float,
     ) -> None:
-        self._divisions, self.whole, self._records, self._count, self._unit = divisions, whole, records, count, unit
+        self._divisions, self.whole, self._unit = divisions, whole, unit
+        self._samples, self._records, self._count = samples, records, count
 
     def loss(self, target: Sequence[int], chosen: Sequence[int], positive: Collection[int] = ()) -> Loss:
         """Return what a fit of columns leaves of the sum of others; gains in `positive` are not negative."""
@@ -118,7 +133,7 @@ class HeldOut:
         for division in self._divisions:
             left, judged = division.left(target, chosen, positive), division.place >= 0
             errors[division.place[judged]] = left[judged]
-        return Loss(errors * self._unit, self._records, self._count)
+        return Loss(errors * self._unit, self._samples, self._records, self._count)
 
     def gains(self, target: Sequence[int], chosen: Sequence[int], positive: Collection[int] = ()) -> FloatArray:
         """Return the gains, shape (k,), of a fit to all data."""

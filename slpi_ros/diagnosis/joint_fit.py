@@ -38,6 +38,8 @@ Factor = tuple[FloatArray, bool]
 # Effects and hysteresis are updated in turn: largest number of iterations, and change (share of the error) below which
 # they stop.
 MOST_TURNS, SETTLED = 15, 0.001
+# Earlier iterations that are mixed, and samples between those by which they are.
+DEPTH, MIXED_EVERY = 4, 7
 # Gauss-Newton steps end when one lowers the objective by less than this share.
 ENOUGH = 1e-3
 # Upper bound of time constants, as a multiple of the duration of the longest record.
@@ -125,7 +127,7 @@ class Joint:
         products = [own.T @ own for own in parts]
         whole, inner = _sum(projected), _sum(products)
         held = [np.diag(_sum(products[k * each : (k + 1) * each])) > 0.0 for k in range(len(self.evidence.parts))]
-        place, records = self._places()
+        place, samples, records = self._places()
         divisions = []
         for groups, factor, record in self._left:
             of_rest = whole - _sum([projected[group] for group in groups])
@@ -141,15 +143,16 @@ class Joint:
             places = np.concatenate([place[group] for group in groups])
             divisions.append(Division(np.asfortranarray(missed), rest, places, fold, own))
         total = inner - whole.T @ _solved(self.factor, whole)
-        return HeldOut(divisions, total, records, len(held), self.problem.scale)
+        return HeldOut(divisions, total, samples, records, len(held), self.problem.scale)
 
-    def _places(self) -> tuple[list[IntArray], IntArray]:
-        """Return where the rows of each group are among the judged ones, in time order (-1: nowhere); their records."""
+    def _places(self) -> tuple[list[IntArray], IntArray, IntArray]:
+        """Return for each group where its rows are among the judged ones, in time order; samples, records."""
         record, fold = np.divmod(np.repeat(np.arange(len(self._groups)), np.diff(self._ends)), FOLDS + 1)
         judged = (fold > 0) & (np.isin(record, self._judged_alone) | self.predictable[self._samples])
         places = np.full(self._samples.size, -1)
         places[judged] = np.argsort(np.argsort(self._samples[judged], kind="stable"), kind="stable")
-        return [places[slice(*ends)] for ends in pairwise(self._ends)], np.sort(record[judged])
+        samples = np.sort(self._samples[judged])
+        return [places[slice(*ends)] for ends in pairwise(self._ends)], samples, np.sort(record[judged])
 
     @cached_property
     def predictable(self) -> Mask:
@@ -322,6 +325,23 @@ def _sum(parts: Sequence[FloatArray]) -> FloatArray:
     return reduce(operator.add, parts)
 
 
+class Anderson:
+    """Anderson's mixing for a fixed point ``x = x + change(x)``: Walker and Ni, SIAM J. Numer. Anal. 49 (2011) 1715."""
+
+    def __init__(self) -> None:
+        self._points: list[FloatArray] = []
+        self._changes: list[FloatArray] = []
+
+    def next(self, x: FloatArray, change: FloatArray) -> FloatArray:
+        """Return the next point after `x` with its `change`, shape (N,)."""
+        self._points, self._changes = [*self._points[-DEPTH:], x], [*self._changes[-DEPTH:], change]
+        if len(self._points) == 1:
+            return x + change
+        of_x, of_change = (np.diff(np.array(each), axis=0) for each in (self._points, self._changes))
+        gains = np.linalg.lstsq(of_change[:, ::MIXED_EVERY].T, change[::MIXED_EVERY], rcond=1e-8)[0]
+        return np.asarray(x + change - gains @ (of_x + of_change))
+
+
 class Explanation:
     """Joint fit of the hysteresis and of effects, which are in the order of the signal chain; signals (m, (N,))."""
 
@@ -332,6 +352,7 @@ class Explanation:
     joint: Joint
     h: FloatArray
     added: FloatArray
+    settling: FloatArray
 
     def __init__(self, evidence: Evidence, effects: Sequence[Effect] = (), like: "Explanation | None" = None) -> None:
         self.evidence, self.effects = evidence, in_order(effects)
@@ -355,13 +376,30 @@ class Explanation:
         if not behind:
             return
         if like:
-            self.h, self.added = like.h, like.added
+            self.h, self.added, self.settling = like.h, like.added, like.settling
+        mixing = Anderson()
         for _ in range(MOST_TURNS):
-            h, before = self.h, self.added
-            self.added = _behind(self.effects, h + self._aside, self.around) - h
+            missed = self.y - _behind(self.effects, self.h + self._aside, self.around) - self.settling
+            change = self.y - self.h - self.settling - self._back(missed) - self.added
+            self.added = mixing.next(self.added, change)
             self._fit(beside)
-            if np.ptp(self.added - before) < SETTLED * np.std(self.target - h):
+            if np.ptp(change) < SETTLED * np.std(self.target - self.h):
                 break
+        self.added = _behind(self.effects, self.h + self._aside, self.around) - self.h
+
+    def _back(self, signal: FloatArray) -> FloatArray:
+        """Return a signal, shape (N,), through the adjoint of the effects that are filters of the displacement."""
+        # In reversed time a filter is its own adjoint.
+        filters = [effect for effect in self.effects if effect.is_filter]
+        if not filters:
+            return signal
+        parts = []
+        for part, own in zip(self.evidence.parts, self.around.split(signal), strict=True):
+            around, own = EffectContext((part.t[-1] - part.t)[::-1]), own[::-1]
+            for effect in reversed(filters):
+                own = effect.apply(own, around)
+            parts.append(own[::-1])
+        return np.concatenate(parts)
 
     def _fit(self, beside: Columns) -> None:
         self._x, gains = beside.fit(self.target)

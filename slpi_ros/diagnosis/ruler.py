@@ -25,7 +25,8 @@ LEAST_CHANCE = 1e-12
 
 def beats(one: Loss, other: Loss, noise: float, trials: float = 1.0) -> bool:
     """Return whether a joint fit predicts better than another one, by more than chance and a tenth of the noise (m)."""
-    fall = other.square - one.square
+    own, its = one.beside(other)
+    fall = float(np.mean(its**2) - np.mean(own**2))
     return fall > (LEAST * noise) ** 2 and carries_over(one, other) and chance(one, other, trials) <= CHANCE
 
 
@@ -38,8 +39,8 @@ def carries_over(one: Loss, other: Loss) -> bool:
 def share(one: Loss, without: Loss, noise: float) -> float:
     """Return the share that an effect explains of what is there where it acts, beyond the noise (m)."""
     # Weighted by what it predicts.
-    weights = (without.errors - one.errors) ** 2
-    there, left = (float(np.sum(weights * (each.errors**2 - noise**2))) for each in (without, one))
+    own, its = one.beside(without)
+    left, there = (float(np.sum((its - own) ** 2 * (errors**2 - noise**2))) for errors in (own, its))
     return 1.0 - left / there if there > 0.0 else 0.0
 
 
@@ -55,14 +56,14 @@ def _by_products(one: Loss, other: Loss) -> float:
     With the difference ``d`` of the predictions the squares differ by ``d^2 + 2 d e``, where ``e`` are the errors of
     the better fit: chance is in the products ``d e`` alone.
     """
-    d = other.errors - one.errors
-    products, fall = in_blocks(d * one.errors), float(np.sum(other.errors**2 - one.errors**2))
+    e, without = one.beside(other)
+    products, fall = in_blocks((without - e) * e), float(np.sum(without**2 - e**2))
     return _p_value(fall, 2.0 * float(np.sqrt(np.sum(products**2))), products)
 
 
 def _by_shares(one: Loss, other: Loss) -> float:
     """Return the p-value of the mean share by which the squares of a block fall, whatever their size."""
-    a, b = one.blocks, other.blocks
+    a, b = (in_blocks(errors**2) for errors in one.beside(other))
     shares = (b - a) / np.maximum(a + b, 1e-300)
     around = shares - shares.mean()
     return _p_value(float(np.sum(shares)), float(np.sqrt(np.sum(around**2))), around)

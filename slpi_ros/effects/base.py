@@ -239,6 +239,8 @@ class EffectBase(Protocol):
     needs_feedback: ClassVar[bool] = False
     # Whether the inverse of a whole path is better than that sample by sample, as it looks ahead.
     looks_ahead: ClassVar[bool] = False
+    # Whether it is a linear filter of the displacement.
+    is_filter: ClassVar[bool] = False
     # Whether it acts on the displacement, and depends on the voltage at the piezo, too.
     needs_voltage: ClassVar[bool] = False
     sharing: ClassVar[Sharing] = "shared"

@@ -65,6 +65,7 @@ class Creep(EffectBase):
     name: ClassVar[str] = "creep"
     acts_on: ClassVar[Signal] = "displacement"
     side: ClassVar[Side] = "stage"
+    is_filter: ClassVar[bool] = True
     what: ClassVar[str] = "slow relaxation after each movement, from 0.1 s on"
     compensated: ClassVar[str] = "yes"
     dynamic: ClassVar[bool] = True

@@ -246,6 +246,7 @@ class Resonance(EffectBase):
     name: ClassVar[str] = "resonance"
     acts_on: ClassVar[Signal] = "displacement"
     side: ClassVar[Side] = "stage"
+    is_filter: ClassVar[bool] = True
     what: ClassVar[str] = "modes of the mechanics, ringing or well damped, each with its share of the motion"
     compensated: ClassVar[str] = (
         "on trajectories exactly; sample by sample if a part of the motion follows at once, else what would ring is "

@@ -459,15 +459,25 @@ class Judge:
         """Return the names of the effects that were found."""
         return [effect.name for effect in now.effects if effect.name not in self.search.fixed]
 
+    def without(self, now: Explanation, name: str) -> Explanation:
+        """Return the best joint fit of the other effects."""
+        fit = now.without(name).refined(CONVERGED)
+        names = sorted(effect.name for effect in fit.effects)
+        same = [one for one in self.search.pool.values() if sorted(effect.name for effect in one.effects) == names]
+        known = min(same, key=lambda one: one.loss.square, default=None)
+        if known is None or known.loss.square >= fit.held_out.square:
+            return fit
+        return self.rebuilt(known).refined(CONVERGED)
+
     def senseless(self, now: Explanation) -> dict[str, float]:
         """Return the effects that explain too little of what is there where they act, with that share."""
-        shares = {name: share(now.held_out, now.without(name).held_out, now.noise) for name in self.free(now)}
+        shares = {name: share(now.held_out, self.without(now, name).held_out, now.noise) for name in self.free(now)}
         return {name: found for name, found in shares.items() if found < EXPLAINED}
 
     def meaningful(self, now: Explanation) -> Explanation:
         """Return a joint fit without the effects that explain too little of what is there where they act."""
         while found := self.senseless(now):
-            now = now.without(min(found, key=lambda name: found[name])).refined(CONVERGED)
+            now = self.without(now, min(found, key=lambda name: found[name]))
         return now
 
     def needed(
@@ -475,7 +485,7 @@ class Judge:
     ) -> tuple[Explanation, tuple[str, ...]]:
         """Return a joint fit, and its structures, without what the best one does not need."""
         while True:
-            rest = [(now.without(name).refined(STEPS), structures) for name in self.free(now)]
+            rest = [(self.without(now, name), structures) for name in self.free(now)]
             for name in structures:
                 kept = tuple(other for other in structures if other != name)
                 rest.append((self.rebuilt(Fitted(tuple(now.effects), kept, now.held_out, 0)).refined(STEPS), kept))
@@ -490,7 +500,7 @@ class Judge:
         for _ in range(MOST_EFFECTS):
             rivals, swapped = {}, None
             for name in self.free(now):
-                rest = now.without(name)
+                rest = self.without(now, name)
                 library = Library(rest, tuple(STRUCTURES), self.search.names)
                 size = free(now.effect(name)).size
                 present = {effect.name for effect in rest.effects}
@@ -522,7 +532,7 @@ class Judge:
         while left:
             losses = {name: now.only([*taken, name]).held_out if len(left) > 1 else now.held_out for name in left}
             best = min(left, key=lambda name: losses[name].square)
-            without, others = now.without(best).held_out, rivals.get(best, [])
+            without, others = self.without(now, best).held_out, rivals.get(best, [])
             ordered.append(
                 Named(
                     best,

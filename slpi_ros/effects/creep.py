@@ -13,6 +13,7 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
+    FitContext,
     ResidualContext,
     Side,
     Signal,
@@ -30,6 +31,8 @@ from slpi_ros.effects.parameters import Fit, Leaf, parameter, require
 FASTEST = 0.1
 # Upper bounds on the gains: of each relaxation, and of the sum of those with time constants within a second.
 LARGEST, SOON, LARGEST_SOON = 0.15, 1.0, 0.12
+# A gain is at its bound within this share of it.
+NEAR = 1e-3
 # Candidates: number of single relaxations; sets of several (number, longest time constant as share of the record).
 # Gains below this share of the largest gain are dropped.
 SINGLE, SEVERAL, LEAST_SHARE = 7, ((2, 0.1), (2, 0.5), (3, 0.3), (4, 0.7)), 0.02
@@ -222,6 +225,11 @@ class Creep(EffectBase):
     def limited(cls, changed: dict[str, Any]) -> dict[str, Any]:
         """Return new parameters with the gains within their upper bounds."""
         return changed | {"gains": _reduced(changed["time_constants"], changed["gains"])}
+
+    def plausible(self, context: FitContext) -> bool:
+        """Return whether no gain, nor the sum of those that settle within a second, has ended at its upper bound."""
+        soon = sum((gain for tau, gain in zip(self.time_constants, self.gains, strict=True) if tau < SOON), self.gain)
+        return max(self.gains, default=0.0) < (1.0 - NEAR) * LARGEST and soon < (1.0 - NEAR) * LARGEST_SOON
 
     def starting(self, around: EffectContext, used: Mask) -> FloatArray:
         """Return the decay of creep from a move before each record, shape (N, k), one column per unknown move."""

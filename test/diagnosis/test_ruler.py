@@ -1,5 +1,7 @@
 """The criterion by which one set of effects predicts better than another, on errors made by hand."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -11,7 +13,7 @@ NOISE, SAMPLES = 1e-9, 20_000
 
 def loss(errors, records=1):
     """Return the loss with these errors (m, (N,)), of records of equal length."""
-    return Loss(errors, np.repeat(np.arange(records), errors.size // records), records)
+    return Loss(errors, np.arange(errors.size), np.repeat(np.arange(records), errors.size // records), records)
 
 
 def white(seed, size=SAMPLES):
@@ -73,8 +75,20 @@ def test_what_is_worse_on_one_record_does_not_beat_however_much_it_gains_on_othe
 
 def test_records_of_which_nothing_is_judged_decide_nothing():
     errors = white(5, 1000)
-    of_one = Loss(errors, np.zeros(1000, dtype=np.int64), 2)
-    assert np.isnan(of_one.records[1]) and carries_over(of_one, Loss(1.01 * errors, of_one.record, 2))
+    of_one = Loss(errors, np.arange(1000), np.zeros(1000, dtype=np.int64), 2)
+    assert np.isnan(of_one.records[1]) and carries_over(of_one, replace(of_one, errors=1.01 * errors))
+
+
+def test_only_samples_that_both_judge_are_compared():
+    errors = white(7)
+    with_it, without = loss(errors), loss(errors + line(0.5 * NOISE))
+    # The other one judges half of the samples alone.
+    half = slice(SAMPLES // 2, None)
+    part = Loss(without.errors[half], without.sample[half], without.record[half], 1)
+    own, its = with_it.beside(part)
+    np.testing.assert_array_equal(own, errors[half])
+    np.testing.assert_array_equal(its, part.errors)
+    assert beats(with_it, part, NOISE) and not beats(part, with_it, NOISE)
 
 
 @pytest.mark.parametrize(("explained", "expected"), [(1.0, 1.0), (0.5, 0.75), (0.1, 0.19)])

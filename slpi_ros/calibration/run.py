@@ -514,7 +514,7 @@ def why(verified: Sequence[Mapping[str, TrackingError]], diagnosis: Diagnosis, e
         # On the path of the verification it is undone.
         said.append(f"the delay of {late * 1e3:.3g} ms is undone on a trajectory, and not by setpoints one by one")
     if abs(worst.offset) > worst.rest:
-        creeps = any(effect.resembles_when_old for effect in effects)
+        creeps = any(effect.unsure.slow_share for effect in effects)
         said.append(
             f"most of it is the zero, which has moved since the record before{' and still creeps' * creeps}: before a "
             "scan, reset the memory and call ~/set_zero of the compensator, or close the loop"

@@ -18,7 +18,7 @@ import numpy as np
 import scipy.linalg
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
-from slpi_ros.diagnosis.effect_parameters import EachRecord, bounded, certain, free, moved, steps
+from slpi_ros.diagnosis.effect_parameters import bounded, certain, free, moved, steps
 from slpi_ros.diagnosis.held_out import Division, HeldOut, Loss, solved
 from slpi_ros.diagnosis.prepare import Evidence, Part
 from slpi_ros.diagnosis.ruler import alike_in_a_row
@@ -355,6 +355,7 @@ class Explanation:
     joint: Joint
     h: FloatArray
     added: FloatArray
+    settling: FloatArray
 
     def __init__(self, evidence: Evidence, effects: Sequence[Effect] = (), like: "Explanation | None" = None) -> None:
         self.evidence, self.effects = evidence, in_order(effects)
@@ -367,7 +368,7 @@ class Explanation:
             self.joint = like.joint
         else:
             self.joint = Joint(evidence, self.u, like.joint if like else None)
-        starting = [one.starting(evidence.around, evidence.used, older=evidence.older_moves) for one in self.effects]
+        starting = [one.starting(evidence.around, evidence.used) for one in self.effects]
         self.starts = np.cumsum([0, *(columns.shape[1] for columns in starting)]).tolist()
         self.before = np.column_stack([*starting, evidence.beside])
         beside = self.joint.columns(self.before)
@@ -390,7 +391,7 @@ class Explanation:
         self.added = _behind(self.effects, self.h + self._aside, self.around) - self.h
 
     def _back(self, signal: FloatArray) -> FloatArray:
-        """Return a signal, shape (N,), through the adjoint of the effects that are linear filters of the displacement."""
+        """Return a signal, shape (N,), through the adjoint of the effects that are filters of the displacement."""
         # In reversed time a filter is its own adjoint.
         filters = [effect for effect in self.effects if effect.is_filter]
         if not filters:
@@ -564,23 +565,6 @@ class Explanation:
             effects.append(certain(effect, [spread.pop(0) for _ in free(effect)]))
         return effects
 
-    def certainty(self, name: str) -> float:
-        """Return by how many of its standard deviations an effect differs from none.
-
-        As a whole, its form given, or by a parameter that is 0 where there is none, if that is less certain.
-        """
-        own = np.concatenate([np.full(free(effect).size, effect.name == name) for effect in self.effects])
-        contribution = self.predicted - self.prediction_without(name)
-        if not contribution.any():
-            return 0.0
-        deviation = float(self._deviations(np.column_stack([contribution, self.tangents[:, ~own]]))[0])
-        whole = 1.0 / deviation if deviation > 0.0 else np.inf
-        effect = next(one for one in self.with_uncertainty() if one.name == name)
-        if isinstance(effect, EachRecord):
-            return whole
-        sizes = [leaf for leaf in effect.free_leaves() if leaf.facts.fit and leaf.facts.fit.size]
-        return min([whole, *(abs(leaf.value) / max(effect.uncertainty[leaf.place], 1e-300) for leaf in sizes)])
-
     def _deviations(self, columns: FloatArray) -> FloatArray:
         """Return the standard deviations, shape (k,), of the gains of columns, shape (N, k), metres."""
         # Errors of neighbouring samples are correlated, so there are fewer independent errors than samples.
@@ -650,17 +634,6 @@ class Explanation:
         """Return the fit with additional `columns`, shape (N, k), metres, whose gains are free."""
         evidence = replace(self.evidence, beside=np.column_stack([self.evidence.beside, columns]))
         return Explanation(evidence, self.effects, self)
-
-    def with_older_moves(self) -> "Explanation":
-        """Return the fit in which creep may also continue from moves long before each record."""
-        return Explanation(replace(self.evidence, older_moves=True), self.effects, self).refined(2)
-
-    def bare(self) -> "Explanation":
-        """Return the fit without the additional columns of `beside`, with the effects refitted."""
-        if not self.evidence.beside.shape[1]:
-            return self
-        evidence = replace(self.evidence, beside=self.evidence.beside[:, :0])
-        return Explanation(evidence, self.effects, self).smoothed().refined(2)
 
 
 @dataclass(frozen=True)

@@ -88,7 +88,6 @@ class Evidence:
     basis: Basis  # of the hysteresis
     smoothness: float  # weight of its roughness penalty
     beside: FloatArray = field(default_factory=lambda: np.empty((0, 0)))  # m, (N, k), free gains
-    older_moves: bool = False  # creep may also continue from moves long before a record
 
     def __post_init__(self) -> None:
         if not self.beside.size:

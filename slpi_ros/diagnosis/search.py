@@ -245,7 +245,7 @@ class Library:
         return sorted(found.values(), key=lambda one: one.square)
 
     def fit(self, choice: Choice) -> Explanation | Form:
-        """Return the joint fit with a choice at first parameters; the form of it that is not admissible, if one is not."""
+        """Return the joint fit with a choice at first parameters, or the form of it that is not admissible."""
         target, kept = self.base(choice.removed)
         chosen = [*kept, *(place for form in choice.forms for place in form.places)]
         positive = {place for form in choice.forms for place in form.positive}
@@ -389,7 +389,7 @@ class Named:
     # What all others leave, and the probability that chance makes the set with it so much better.
     without: Loss
     p_value: float
-    # Effects with which a set of no more numbers is not worse; the best other effect in its place, with its rms error (m).
+    # Effects with which a set of no more numbers is not worse; the best one in its place, with its rms error (m).
     alternatives: tuple[str, ...]
     runner_up: tuple[str, float] | None
 

@@ -34,8 +34,6 @@ HELD = 0.6
 NEAR = 0.3
 # Fewest knots whose ratio counts, and largest ratio of a slow change: see `is_course`.
 FEWEST_KNOTS, LARGEST_RATIO = 5, 0.5
-# A shift of one to this number of sampling periods may be any effect that only shifts.
-FEW_SAMPLES = 3.0
 # Number of spectral bins on either side of a peak that are attributed to the peak.
 LINE_WIDTH = 12
 
@@ -247,29 +245,15 @@ class EffectBase(Protocol):
     needs_voltage: ClassVar[bool] = False
     sharing: ClassVar[Sharing] = "shared"
     time_shift: ClassVar[TimeShift] = "none"
-    # Whether a time shift is its special case: if it does not fit better than one, it is not there.
-    contains_shift: ClassVar[bool] = False
     # Whether a single drive frequency cannot tell it from the other effects of which this is true.
     dynamic: ClassVar[bool] = False
     # Whether a change of the sensitivity between records may be its doing.
     changes_gain: ClassVar[bool] = False
-    # Whether it is a course of time that nothing else determines, which may also stand for what changes with the drive.
-    free_course: ClassVar[bool] = False
     # Whether it follows recorded quantities.
     follows_quantities: ClassVar[bool] = False
-    # Effects that follow time alone: it counts only beside its `confounders`, which they contain, and then they are no
-    # alternatives.
-    proved_beside: ClassVar[tuple[str, ...]] = ()
-    # Effect that it resembles if it continues from long before a record.
-    resembles_when_old: ClassVar[str] = ""
 
     def __post_init__(self) -> None:
         require_facts(self)
-
-    @classmethod
-    def companion(cls) -> "Effect | None":
-        """Return the effect against which it trades, and with which it is fitted therefore, as it is at first."""
-        return None
 
     def plausible(self, context: "FitContext") -> bool:
         """Return whether the parameters are plausible, so that the effect does not imitate another cause."""
@@ -294,25 +278,12 @@ class EffectBase(Protocol):
         """Return whether one set of parameters can hold for all records of a fit, and for others."""
         return True
 
-    def confounders(self, context: "ResidualContext") -> FloatArray:
-        """Return signals (m, (N, k)) that others may add, beside which it has to prove itself; of most effects none."""
-        return np.empty((context.t.size, 0))
-
-    @property
-    def at_bound(self) -> bool:
-        """Whether a parameter is at its upper bound, where the effect stands for something else."""
-        return False
-
-    def simpler(self, step: float) -> "Effect | None":
-        """Return the simpler effect that looks the same in records with a sampling interval of `step` (s), if any."""
-        return None
-
     def joined(self, other: Self) -> Self | None:
         """Return one effect that stands for both; None if an axis has it once, or if it would hold too much."""
         return None
 
-    def starting(self, around: EffectContext, used: Mask, *, older: bool = False) -> FloatArray:
-        """Return what is left (m, (N, k)) of its state before each record, with `older` also of long before."""
+    def starting(self, around: EffectContext, used: Mask) -> FloatArray:
+        """Return what is left (m, (N, k)) of its state before each record."""
         return np.empty((around.t.size, 0))
 
     def started(self, amplitudes: FloatArray, records: int) -> Self:

@@ -13,6 +13,7 @@ from slpi_ros.effects.base import (
     Candidate,
     EffectBase,
     EffectContext,
+    FitContext,
     ResidualContext,
     Side,
     Signal,
@@ -71,7 +72,6 @@ class Creep(EffectBase):
     what: ClassVar[str] = "slow relaxation after each movement, from 0.1 s on"
     compensated: ClassVar[str] = "yes"
     dynamic: ClassVar[bool] = True
-    resembles_when_old: ClassVar[str] = "thermal_drift"
     excitation: ClassVar[Excitation] = Excitation(
         "Quick moves up and down, each followed by a hold, the later ones longer: at constant voltage hysteresis, "
         "lag and delay are still, and only creep goes on, in proportion to the move and in its direction.",
@@ -226,19 +226,16 @@ class Creep(EffectBase):
         """Return new parameters with the gains within their upper bounds."""
         return changed | {"gains": _reduced(changed["time_constants"], changed["gains"])}
 
-    @property
-    def at_bound(self) -> bool:
-        """Whether a gain, the sum of those that settle within a second, or an exponent is at its upper bound."""
-        if not isinf(self.exponent):
-            return not (self.gain < (1.0 - NEAR) * LARGEST_SOON and self.exponent < (1.0 - NEAR) * MOST_POWER)
-        soon = sum(gain for tau, gain in zip(self.time_constants, self.gains, strict=True) if tau < SOON)
-        return not (max(self.gains) < (1.0 - NEAR) * LARGEST and soon < (1.0 - NEAR) * LARGEST_SOON)
+    def plausible(self, context: FitContext) -> bool:
+        """Return whether no gain, nor the sum of those that settle within a second, has ended at its upper bound."""
+        soon = sum((gain for tau, gain in zip(self.time_constants, self.gains, strict=True) if tau < SOON), self.gain)
+        return max(self.gains, default=0.0) < (1.0 - NEAR) * LARGEST and soon < (1.0 - NEAR) * LARGEST_SOON
 
-    def starting(self, around: EffectContext, used: Mask, *, older: bool = False) -> FloatArray:
+    def starting(self, around: EffectContext, used: Mask) -> FloatArray:
         """Return the decay of creep from a move before each record, shape (N, k), one column per unknown move."""
         if isinf(self.exponent):
-            return _settling(self.time_constants, around, used, older=older)
-        return _settling(_power_times(self.exponent), around, used, _power(self.exponent), older=older)
+            return _settling(self.time_constants, around, used)
+        return _settling(_power_times(self.exponent), around, used, _power(self.exponent))
 
     def started(self, amplitudes: FloatArray, records: int) -> "Creep":
         """Return the creep with the move before the records (`initial`) if several records agree on it."""
@@ -383,15 +380,12 @@ def _settling(
     around: EffectContext,
     used: Mask,
     gains: FloatArray | None = None,
-    *,
-    older: bool = False,
 ) -> FloatArray:
     """Return the decay of creep that began before each record, shape (N, k), one column per identifiable relaxation."""
     # A law, logarithmic or with the `gains` of a power of time, has a single column, for a move just before the record.
-    # With `older` there is a second one, for a move one record duration before it, of which only the slow part remains.
     whole = []
     for own in range(max(len(around.records), 1)):
-        for column in _settling_of(time_constants, around.split(around.t)[own], around.split(used)[own], older, gains):
+        for column in _settling_of(time_constants, around.split(around.t)[own], around.split(used)[own], gains):
             parts = [np.zeros_like(t) for t in around.split(around.t)]
             parts[own] = column
             whole.append(np.concatenate(parts))
@@ -399,13 +393,12 @@ def _settling(
 
 
 def _settling_of(
-    time_constants: Sequence[float] | FloatArray, t: FloatArray, used: Mask, older: bool, gains: FloatArray | None
+    time_constants: Sequence[float] | FloatArray, t: FloatArray, used: Mask, gains: FloatArray | None
 ) -> list[FloatArray]:
     times = t[used]
     since = np.maximum(t - times[0], 0.0)
     if len(time_constants) >= LAW_FEWEST:
-        ages = (0.0, float(times[-1] - times[0])) if older else (0.0,)
         shares, rest = (np.ones(len(time_constants)), 0.0) if gains is None else (gains, float(np.sum(gains)))
-        each = list(zip(time_constants, shares, strict=True))
-        return [np.sum([share * np.exp(-(since + age) / tau) for tau, share in each], axis=0) - rest for age in ages]
+        each = zip(time_constants, shares, strict=True)
+        return [np.sum([share * np.exp(-since / tau) for tau, share in each], axis=0) - rest]
     return [np.exp(-since / tau) for tau in time_constants if tau < SOON_SETTLED * (times[-1] - times[0])]

@@ -51,7 +51,6 @@ class GainDrift(EffectBase):
     what: ClassVar[str] = "the sensitivity changes slowly"
     compensated: ClassVar[str] = "as it was at the end of the record; its course belongs to the record"
     needs_feedback: ClassVar[bool] = True
-    free_course: ClassVar[bool] = True
     sharing: ClassVar[Sharing] = "separate"
     changes_gain: ClassVar[bool] = True
     excitation: ClassVar[Excitation] = Excitation(

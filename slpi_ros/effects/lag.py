@@ -9,7 +9,6 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import (
-    FEW_SAMPLES,
     Candidate,
     EffectBase,
     EffectContext,
@@ -21,7 +20,6 @@ from slpi_ros.effects.base import (
     by_record,
     usual_step,
 )
-from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, at_speeds
 from slpi_ros.effects.filters import DAMPING, Dynamics, Hold, filtered, first_order, hold
 from slpi_ros.effects.parameters import Fit, in_samples, parameter
@@ -76,10 +74,6 @@ class Lag(EffectBase):
     @classmethod
     def _times(cls, tau: float, gains: FloatArray) -> "Lag | None":
         return cls(tau * float(gains[0])) if gains[0] > 0 else None
-
-    def simpler(self, step: float) -> Delay | None:
-        """Return the delay that looks the same with a sampling interval of `step` (s), for a lag of a few samples."""
-        return Delay(self.time_constant) if step <= self.time_constant < FEW_SAMPLES * step else None
 
     @property
     def slow_shift(self) -> float:

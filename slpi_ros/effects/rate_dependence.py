@@ -22,7 +22,6 @@ from slpi_ros.effects.base import (
     TimeShift,
     Unsure,
 )
-from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter
 from slpi_ros.hysteresis.rate_law import followed, solved
@@ -108,11 +107,6 @@ class RateDependence(EffectBase):
     def unsure(self) -> Unsure:
         """The creep of the law, which goes on for ever: beyond the records it is true within half of it either way."""
         return Unsure(slow_volts=self.threshold / sqrt(12.0))
-
-    @classmethod
-    def companion(cls) -> Delay:
-        """Return a delay, against which the law trades."""
-        return Delay(0.0)
 
     @classmethod
     def limited(cls, changed: dict[str, Any]) -> dict[str, Any]:

@@ -253,7 +253,6 @@ class Resonance(EffectBase):
         "taken out"
     )
     time_shift: ClassVar[TimeShift] = "partly"
-    contains_shift: ClassVar[bool] = True
     looks_ahead: ClassVar[bool] = True
     excitation: ClassVar[Excitation] = Excitation(
         "Small steps as fast as allowed with time to ring down, at three levels, then a sweep up to a sixth of the "

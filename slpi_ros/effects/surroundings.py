@@ -38,8 +38,6 @@ TIME_CONSTANTS, SHORTEST, LONGEST = 6, 1.0, 0.5
 LEADS = (1.5, 6.0)
 # Largest plausible change of the sensitivity.
 LARGEST = 0.3
-# Time constants, as shares of a record, of the drifts beside which a quantity has to prove itself.
-SETTLES_WITHIN = (0.03, 0.1, 0.3)
 
 
 def _draw(path: DrivePath, limits: DriveLimits) -> None:
@@ -113,7 +111,6 @@ class Surroundings(EffectBase):
     compensated: ClassVar[str] = "yes, if the quantity is measured in use"
     changes_gain: ClassVar[bool] = True
     follows_quantities: ClassVar[bool] = True
-    proved_beside: ClassVar[tuple[str, ...]] = ("thermal_drift", "gain_drift")
     excitation: ClassVar[Excitation] = Excitation(
         "Full loops one after the other while one quantity alone is changed on purpose, up and down several times and "
         "each time for another while (heat on and off, load on and off): what comes and goes with it is its doing, "
@@ -217,7 +214,7 @@ class Surroundings(EffectBase):
         count = len(self._lags)
         return replace(self, initial=self.initial[k * count : (k + 1) * count])
 
-    def starting(self, around: EffectContext, used: Mask, *, older: bool = False) -> FloatArray:
+    def starting(self, around: EffectContext, used: Mask) -> FloatArray:
         """Return what is left of before each record for each quantity with a time constant, shape (N, k)."""
         return np.column_stack([np.empty((around.t.size, 0)), *_settling(self._lags, around).values()])
 
@@ -280,27 +277,6 @@ class Surroundings(EffectBase):
         offset = gains[0] if with_offset else 0.0
         sensitivity = gains[-1] if count == 2 or not with_offset else 0.0
         return cls((replace(one, offset_gain=offset, sensitivity_gain=sensitivity),), low)
-
-    def confounders(self, context: ResidualContext) -> FloatArray:
-        """Return the drifts (m, (N, k)) that each record may have, beside which a quantity has to prove itself."""
-        # Anything that settles or runs away: a straight line, its square, and relaxations from the start of the record.
-        # A quantity that only does that itself is no cause, however well it fits.
-        around = context.around
-        rows, times = np.arange(around.t.size), around.split(around.t)
-        moved = (context.h - float(context.h.min()))[:, None]
-        columns = []
-        turns = any(one.sensitivity_gain for one in self.quantities)
-        for k, (own, t) in enumerate(zip(around.split(rows), times, strict=True)):
-            since = (t - t[0]) / max(float(t[-1] - t[0]), 1e-300)
-            smooth = np.column_stack([since, since**2, *(np.exp(-since / share) for share in SETTLES_WITHIN)])
-            whole = np.zeros((around.t.size, smooth.shape[1]))
-            whole[own] = smooth * float(np.ptp(context.h))
-            columns.append(whole)
-            if turns:
-                whole = np.zeros((around.t.size, smooth.shape[1] + (k > 0)))
-                whole[own] = (np.column_stack([smooth, np.ones(t.size)]) if k else smooth) * moved[own]
-                columns.append(whole)
-        return np.column_stack(columns)
 
     def describe(self) -> str:
         """Describe for each quantity what one unit does, and the time constant."""

@@ -48,7 +48,6 @@ class ThermalDrift(EffectBase):
     what: ClassVar[str] = "slow change that does not follow the voltage"
     compensated: ClassVar[str] = "no"
     needs_feedback: ClassVar[bool] = True
-    free_course: ClassVar[bool] = True
     excitation: ClassVar[Excitation] = Excitation(
         "The same full loop over and over, with the same holds: voltage, memory and creep repeat, so what differs "
         "from one repeat to the next follows time alone.",

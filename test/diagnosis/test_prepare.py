@@ -5,8 +5,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from slpi_ros.diagnosis.candidates import seen
 from slpi_ros.diagnosis.prepare import Evidence, Part, excited_frequency
+from slpi_ros.diagnosis.search import seen
 from slpi_ros.effects.hum import Hum, Line
 from slpi_ros.identification.bases import SurfaceBasis
 

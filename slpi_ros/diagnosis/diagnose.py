@@ -10,12 +10,13 @@ from threadpoolctl import threadpool_limits
 
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.arrays.rates import fastest
+from slpi_ros.diagnosis.answer import Answer, answer_of
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged, signals_of
 from slpi_ros.diagnosis.ruler import NO_WORSE, beats
-from slpi_ros.diagnosis.search import Answer, Judge, Search, is_own, seen
+from slpi_ros.diagnosis.search import is_own, seen
 from slpi_ros.diagnosis.structures import BIAS
 from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.chain import Chain
@@ -125,7 +126,7 @@ def following(
         with threadpool_limits(1):
             evidence = evidence_of(undone, axis, replace(known, sensor=IDEAL), start, stop)
             names = [name for name, effect in EFFECTS.items() if effect.follows_quantities]
-            now = Judge(Search(Explanation(evidence, ()), names=names)).answer().now
+            now = answer_of(Explanation(evidence, ()), names).now
             follows = [key for effect in now.effects for key in effect.keys]
             if follows:
                 axes[axis] = replace(_extended(known, now, source), sensor=known.sensor)
@@ -172,13 +173,14 @@ def _diagnose_axis(
     source = ", ".join(part.source for part in evidence.parts)
     given = _given(model, runs, found)
     extension = _extension(model, found, given, source)
-    if extension and not _carries_over(extension.with_own, runs):
+    while extension and not _carries_over(extension.judged, runs):
         # What makes a record worse is neither named nor in the model.
-        found = found.without_all()
+        if not found.named:
+            extension = None
+            break
+        found = found.without_last()
         given = _given(model, runs, found)
         extension = _extension(model, found, given, source)
-        if extension and not _carries_over(extension.with_own, runs):
-            extension = None
     # A hysteresis as smooth as beside the effects that were tried takes up less of what is left.
     signals = signals_of(found.now)
     if not (extension or found.named):
@@ -197,12 +199,13 @@ def _diagnose_axis(
 class _Extension(NamedTuple):
     """Refitted model, and its free run on each record.
 
-    `with_own` are its free runs with the effects of each record, such as drift, by which the causes are judged.
+    `judged` are its free runs with the effects of each record, such as drift, and with what goes on from before it, by
+    which the causes are judged.
     """
 
     model: AxisModel
     runs: Sequence[FreeRun]
-    with_own: Sequence[FreeRun]
+    judged: Sequence[FreeRun]
 
 
 def _extension(model: AxisModel, answer: Answer, given: Given, source: str) -> _Extension | None:
@@ -212,19 +215,22 @@ def _extension(model: AxisModel, answer: Answer, given: Given, source: str) -> _
     if not (given.changed or BIAS in answer.structures or answer.named):
         return None
     extended = _extended(model, answer.now, source)
-    runs = _runs(extended, answer.now)
-    own = any(isinstance(one, EachRecord) for one in answer.now.effects)
-    return _Extension(extended, runs, _runs(extended, answer.now, own=True) if own else runs)
+    return _Extension(extended, _runs(extended, answer.now), _runs(extended, answer.now, own=True))
 
 
 def _runs(model: AxisModel, now: Explanation, *, own: bool = False) -> list[FreeRun]:
     """Return the free run of an extended model on each of its records, as the effects began there.
 
-    With `own`, also with the effects of each record, such as drift.
+    With `own`, also with the effects of each record, such as drift, and with what goes on from before it.
     """
     separate: list[Any] = [effect for effect in now.effects if isinstance(effect, EachRecord)]
+    if own:
+        begun = [effect.started(np.zeros_like(now.began.get(effect.name, ())), 2) for effect in model.effects]
+        model = replace(model, effects=tuple(begun))
     runs = []
-    for k, part in enumerate(now.evidence.parts):
+    for k, (part, rows) in enumerate(zip(now.evidence.parts, now.evidence.slices, strict=True)):
+        if own:
+            part = replace(part, y=part.y - now.settling[rows])
         added = [each.parts[k] for each in separate if own]
         # An error of the sensor goes with its reading, whose zero is not that of the model.
         for effect in added:
@@ -259,15 +265,15 @@ def _answer(base: Explanation, of_family: Evidence | None) -> Answer:
 def _of_kind(base: Explanation, of_family: Evidence | None) -> Answer:
     """Return the answer, with the loop family as hysteresis if that predicts better than the kind of `base`."""
     if of_family is None:
-        return Judge(Search(base)).answer()
+        return answer_of(base)
     family = Explanation(of_family, base.effects)
     found = None
     if not beats(family.held_out, base.held_out, base.noise):
-        found = Judge(Search(base)).answer()
+        found = answer_of(base)
         with_effects = Explanation(of_family, found.now.effects).refined(2)
         if not beats(with_effects.held_out, found.now.held_out, found.now.noise):
             return found
-    answer = Judge(Search(family)).answer()
+    answer = answer_of(family)
     return replace(answer, base=base, structures=(BIAS, *answer.structures))
 
 

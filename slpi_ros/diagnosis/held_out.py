@@ -18,6 +18,8 @@ from slpi_ros.arrays import FloatArray, IntArray, Mask
 BLOCKS = 200
 # Weight of a record that is left out in gains that the other records hardly determine.
 UNDETERMINED = 0.05
+# Largest error that is told, in multiples of the displacement.
+FARTHEST = 1e6
 # Regularisation that keeps the gains unique for collinear columns, relative to the size of the columns.
 RIDGE = 1e-9
 
@@ -133,6 +135,8 @@ class HeldOut:
         for division in self._divisions:
             left, judged = division.left(target, chosen, positive), division.place >= 0
             errors[division.place[judged]] = left[judged]
+        # A form far from the data may have errors beyond all bounds.
+        errors = np.clip(np.nan_to_num(errors, nan=FARTHEST), -FARTHEST, FARTHEST)
         return Loss(errors * self._unit, self._samples, self._records, self._count)
 
     def gains(self, target: Sequence[int], chosen: Sequence[int], positive: Collection[int] = ()) -> FloatArray:

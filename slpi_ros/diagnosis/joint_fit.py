@@ -141,7 +141,10 @@ class Joint:
             sizes = [parts[group].shape[0] for group in groups]
             fold = np.repeat([group % each if record >= 0 else 0 for group in groups], sizes)
             places = np.concatenate([place[group] for group in groups])
-            divisions.append(Division(np.asfortranarray(missed), rest, places, fold, own))
+            # What the others cannot predict of a record says nothing of its zero, nor of its drift.
+            ends = [slice(self._ends[group], self._ends[group + 1]) for group in groups]
+            known = np.concatenate([self.predictable[self._samples[rows]] | (record < 0) for rows in ends])
+            divisions.append(Division(np.asfortranarray(missed[known]), rest, places[known], fold[known], own))
         total = inner - whole.T @ _solved(self.factor, whole)
         return HeldOut(divisions, total, samples, records, len(held), self.problem.scale)
 

@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
+from slpi_ros.diagnosis.answer import Answer, Named
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.fingerprint import Left, Signals, fingerprint, half_power, hint
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import MOST_SAMPLES, Evidence, one_speed
-from slpi_ros.diagnosis.search import Answer, Named
 from slpi_ros.diagnosis.structures import BIAS, LEVEL, NOT_CLOSING
 from slpi_ros.effects.base import Effect, usual_step
 from slpi_ros.effects.excitation import FASTEST
@@ -275,10 +275,9 @@ def _evidence(effect: Effect, named: Named, answer: Answer) -> str:
         f"{effect.describe()}; held-out error, on the {on}: {before} before, {after} rms with it; all effects found "
         f"{end}, the same without this one {without} (p = {named.p_value:.2g} that chance gains as much)"
     )
-    if not named.runner_up:
+    if not named.rivals:
         return gained
-    other, rms = named.runner_up
-    return f"{gained}; with {other} instead {length(rms)}"
+    return f"{gained}; with {named.rivals[0].name} instead {length(named.rivals[0].loss.rms)}"
 
 
 def _verdict(answer: Answer, effects: tuple[NamedEffect, ...], noise_rms: float) -> str:

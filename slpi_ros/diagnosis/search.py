@@ -1,8 +1,8 @@
 """Search for the set of effects that predicts best what was not fitted."""
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass, field, replace
-from functools import cached_property, partial
+from dataclasses import dataclass
+from functools import partial
 from itertools import pairwise
 from typing import Any
 
@@ -13,8 +13,7 @@ from slpi_ros.diagnosis.effect_parameters import EachRecord, free
 from slpi_ros.diagnosis.held_out import RIDGE, HeldOut, Loss
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import drive_frequency, excited_frequency
-from slpi_ros.diagnosis.ruler import EXPLAINED, LEAST, beats, chance, independent_trials, share
-from slpi_ros.diagnosis.structures import STRUCTURES
+from slpi_ros.diagnosis.ruler import LEAST, independent_trials
 from slpi_ros.effects.base import Candidate, Effect, FitContext, is_course
 from slpi_ros.effects.registry import EFFECTS
 from slpi_ros.errors import ModelError
@@ -28,6 +27,8 @@ PLACES = ((1, 4), (2, 2), (3, 1))
 STEPS, CONVERGED = 5, 15
 # Largest number of rounds, each with columns at new parameters.
 MOST_ROUNDS = 6
+# A round that lowers the mean square by less than this share is the last one.
+LEAST_GAINED = 0.002
 
 
 def is_own(effect: Effect | type[Any]) -> bool:
@@ -61,31 +62,33 @@ def is_plausible(effect: Effect, now: Explanation) -> bool:
 
 @dataclass(frozen=True)
 class Fitted:
-    """A set of effects with their parameters, the defects of the hysteresis fitted beside it, and what it leaves."""
+    """A set of effects with their parameters, and what it leaves."""
 
     effects: tuple[Effect, ...]
-    structures: tuple[str, ...]
     loss: Loss
-    numbers: int
 
     @classmethod
-    def of(cls, now: Explanation, structures: tuple[str, ...]) -> "Fitted":
+    def of(cls, now: Explanation) -> "Fitted":
         """Return what is kept of a joint fit."""
-        numbers = sum(free(effect).size for effect in now.effects) + now.evidence.beside.shape[1]
-        return cls(tuple(now.effects), structures, now.held_out, numbers)
+        return cls(tuple(now.effects), now.held_out)
 
     @property
-    def key(self) -> tuple[tuple[str, ...], int]:
-        """Names of the effects and structures, and how many numbers they have."""
-        return (*sorted(effect.name for effect in self.effects), *self.structures), self.numbers
+    def numbers(self) -> int:
+        """How many numbers the effects have."""
+        return sum(free(effect).size for effect in self.effects)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the effects."""
+        return tuple(sorted(effect.name for effect in self.effects))
 
 
 @dataclass(frozen=True, eq=False)
 class Form:
-    """One form of an effect, or of a defect of the hysteresis, with its place among the columns."""
+    """One form of an effect, with its place among the columns."""
 
     name: str
-    candidate: Candidate | Effect | None  # None: of the hysteresis
+    candidate: Candidate | Effect
     first: int
     end: int
     numbers: int
@@ -125,7 +128,7 @@ class Choice:
 class Library:
     """Columns of all candidates for a joint fit, with which sets are compared to first order."""
 
-    def __init__(self, now: Explanation, structures: Collection[str], names: Collection[str] | None = None) -> None:
+    def __init__(self, now: Explanation, names: Collection[str] | None = None) -> None:
         self.now = now
         effects = now.effects
         contributions = [now.predicted - now.prediction_without(effect.name) for effect in effects]
@@ -138,7 +141,7 @@ class Library:
             effect.name: (1 + k, [*starts[k], *range(*ends[k : k + 2].tolist())]) for k, effect in enumerate(effects)
         }
         sampled, forms, place = [now.joint.sampled(own)], [], own.shape[1]
-        for name, candidate, columns in self._candidates(structures, names):
+        for name, candidate, columns in self._candidates(names or EFFECTS):
             numbers = columns.shape[1]
             forms.append(Form(name, candidate, place, place + numbers, numbers))
             sampled.append(now.joint.sampled(columns))
@@ -151,23 +154,17 @@ class Library:
         self.held_out: HeldOut = now.joint.held_out(at / self._size)
         self._known: dict[tuple[frozenset[str], frozenset[Form]], Choice] = {}
 
-    def _candidates(
-        self, structures: Collection[str], names: Collection[str] | None
-    ) -> Iterator[tuple[str, Candidate | Effect | None, FloatArray]]:
-        for name in EFFECTS if names is None else names:
+    def _candidates(self, names: Collection[str]) -> Iterator[tuple[str, Candidate | Effect, FloatArray]]:
+        for name in names:
             for form in _forms(name, self.now):
                 if isinstance(form, Candidate):
                     if form.columns.shape[1] and np.isfinite(form.columns).all():
                         yield name, form, form.columns
-                else:
-                    try:
-                        yield name, form, (self.now.predicted_with(form) - self.now.predicted)[:, None]
-                    except ModelError:
-                        continue
-        if names is None:
-            for name, columns in STRUCTURES.items():
-                if name not in structures:
-                    yield name, None, columns(self.now)
+                    continue
+                try:
+                    yield name, form, (self.now.predicted_with(form) - self.now.predicted)[:, None]
+                except ModelError:
+                    continue
 
     def base(self, removed: Collection[str]) -> tuple[list[int], list[int]]:
         """Return the columns that add up to the target, and those of the effects that stay."""
@@ -255,9 +252,6 @@ class Library:
             [effect.name for effect in self.now.effects if effect.name not in choice.removed], refine=False
         )
         for form in choice.forms:
-            if form.candidate is None:
-                fit = fit.beside(STRUCTURES[form.name](self.now))
-                continue
             try:
                 own = np.array([at[place] for place in (form.positive or form.places)])
                 effect = form.candidate.effect(own) if isinstance(form.candidate, Candidate) else form.candidate
@@ -287,264 +281,91 @@ def _each(forms: Sequence[Candidate], gains: FloatArray) -> EachRecord | None:
     return EachRecord(found) if len(found) == len(parts) else None
 
 
-@dataclass
 class Search:
-    """Search from a joint fit without new effects; `fixed` are the effects that it has."""
+    """Search for the set that predicts best, from a joint fit without new effects.
 
-    base: Explanation
-    names: Sequence[str] | None = None
-    pool: dict[Any, Fitted] = field(default_factory=dict)
-    trials: float = 1.0
-    structures: tuple[str, ...] = ()
+    All sets that were fitted are in `pool`, by name and number of numbers; `trials` is the number of independent ones
+    of those that were compared. With `names` only these effects are looked for.
+    """
 
-    @cached_property
-    def fixed(self) -> tuple[str, ...]:
-        """Names of the effects of the given model."""
-        return tuple(effect.name for effect in self.base.effects)
+    def __init__(self, base: Explanation, names: Sequence[str] | None = None) -> None:
+        self.base, self.names = base, names
+        self.fixed = tuple(effect.name for effect in base.effects)
+        self.pool: dict[tuple[tuple[str, ...], int], Fitted] = {}
+        self.trials = 1.0
 
-    def note(self, now: Explanation, structures: tuple[str, ...]) -> Fitted:
-        """Keep a joint fit, if it is the best one of its set."""
-        fitted = Fitted.of(now, structures)
-        if fitted.key not in self.pool or fitted.loss.square < self.pool[fitted.key].loss.square:
-            self.pool[fitted.key] = fitted
-        return fitted
-
-    def plausible(self, now: Explanation) -> tuple[Explanation, list[str]]:
-        """Return a joint fit without the effects, and parts of effects, that mean nothing, and the names of effects."""
-        nonsense: list[str] = []
-        for effect in now.effects:
-            if effect.name in self.fixed or is_plausible(now.effect(effect.name), now):
-                continue
-            part = now.effect(effect.name).only_plausible(seen(now))
-            if part is not None and free(part).size:
-                fewer = now.replacing(effect.name, part).refined(1)
-                if is_plausible(fewer.effect(effect.name), fewer):
-                    now = fewer
-                    continue
-            nonsense.append(effect.name)
-            now = now.without(effect.name)
-        return now, nonsense
-
-    def run(self) -> tuple[Explanation, tuple[str, ...]]:
-        """Return the best joint fit that was found, and the structures beside it."""
-        now, structures = self.base, self.structures
-        self.note(now, structures)
+    def run(self) -> Explanation:
+        """Return the best joint fit that was found."""
+        now = self.base
+        self._note(now)
         for _ in range(MOST_ROUNDS):
             report_progress(f"{len(now.effects)} effects, {now.held_out.rms * 1e9:.3g} nm left, trying others")
-            library = Library(now, structures, self.names)
-            best, best_structures = now, structures
-            choices = library.choices(self.fixed)
-            self.trials = max(self.trials, independent_trials(now.held_out.blocks, [one.blocks for one in choices]))
-            tried: set[tuple[Any, ...]] = set()
-            for _ in range(MOST_TRIED):
-                choice = next(
-                    (one for one in self.worth_fitting(choices, now) if (one.removed, one.forms) not in tried), None
-                )
-                if choice is None:
-                    break
-                tried.add((choice.removed, choice.forms))
-                found = library.fit(choice)
-                if isinstance(found, Form):
-                    library.forms.remove(found)
-                    choices = library.choices(self.fixed)
-                    continue
-                ref = found.refined(STEPS)
-                fit, nonsense = self.plausible(ref)
-                if nonsense:
-                    # What is left of it may mean something.
-                    fit, worse = self.plausible(fit.refined(STEPS))
-                    library.ban([form for form in choice.forms if form.name in nonsense])
-                    choices = library.choices(self.fixed)
-                    if worse:
-                        continue
-                taken = (*structures, *(form.name for form in choice.forms if form.candidate is None))
-                self.note(fit, taken)
-                if fit.held_out.square < best.held_out.square:
-                    best, best_structures = fit, taken
+            best = self._round(now)
             if best is now:
                 break
             gained = 1.0 - best.held_out.square / now.held_out.square
-            now, structures = best.refined(CONVERGED), best_structures
-            if now.held_out.square > best.held_out.square:
-                now = best
-            self.note(now, structures)
-            if gained < 0.002:
+            refined = best.refined(CONVERGED)
+            now = refined if refined.held_out.square < best.held_out.square else best
+            self._note(now)
+            if gained < LEAST_GAINED:
                 break
-        return now, structures
-
-    def worth_fitting(self, choices: Sequence[Choice], now: Explanation) -> list[Choice]:
-        """Return the choices with the least error of each number of forms, few forms first."""
-        most = now.held_out.square - (LEAST * now.noise) ** 2
-        better = [one for one in choices if one.forms and one.square < most]
-        return [one for count, most in PLACES for one in [each for each in better if len(each.forms) == count][:most]]
-
-
-@dataclass(frozen=True)
-class Named:
-    """An effect of the answer, with what the effects before it leave, without it and with it."""
-
-    name: str
-    before: Loss
-    after: Loss
-    # What all others leave, and the probability that chance makes the set with it so much better.
-    without: Loss
-    p_value: float
-    # Effects with which a set of no more numbers is not worse; the best one in its place, with its rms error (m).
-    alternatives: tuple[str, ...]
-    runner_up: tuple[str, float] | None
-
-
-@dataclass(frozen=True)
-class Answer:
-    """The set of effects that a diagnosis gives: joint fit without and with it."""
-
-    base: Explanation
-    now: Explanation
-    # The largest gain first; each gain is relative to the preceding effects.
-    named: tuple[Named, ...]
-    # Defects of the hysteresis model: `BIAS`, or keys of `STRUCTURES`.
-    structures: tuple[str, ...] = ()
-    # Effects that sets which predict better have, but do not mean what they are called, or are worse on a record.
-    dropped: tuple[str, ...] = ()
-    trials: float = 1.0
-
-    def without_all(self) -> "Answer":
-        """Return the answer that names nothing."""
-        names = {*self.dropped, *(one.name for one in self.named)}
-        return replace(self, now=self.base, named=(), dropped=tuple(sorted(names)))
-
-
-class Judge:
-    """Choice of the answer among the sets of a search, and its alternatives."""
-
-    def __init__(self, search: Search) -> None:
-        self.search, self.base = search, search.base
-        self._noise = 0.0
-
-    def rebuilt(self, fitted: Fitted) -> Explanation:
-        """Return the joint fit of a set again."""
-        base = self.base
-        for name in fitted.structures:
-            base = base.beside(STRUCTURES[name](self.base))
-        return Explanation(base.evidence, fitted.effects, base)
-
-    def numbers(self, now: Explanation) -> int:
-        """Return how many numbers a joint fit has."""
-        return Fitted.of(now, ()).numbers
-
-    def beats(self, one: Explanation | Fitted, other: Explanation | Fitted) -> bool:
-        """Return whether one set is better than another one."""
-        a, b = (each.loss if isinstance(each, Fitted) else each.held_out for each in (one, other))
-        return beats(a, b, self._noise, self.search.trials)
-
-    def answer(self) -> Answer:
-        """Return the set with the fewest numbers of those that the best one does not beat."""
-        now, structures = self.search.run()
-        self._noise = now.noise
-        best = now = self.meaningful(now)
-        for fitted in sorted(self.search.pool.values(), key=lambda one: (one.numbers, one.loss.square)):
-            if fitted.numbers >= self.numbers(now):
-                break
-            if not self.beats(best, fitted):
-                fewer = self.rebuilt(fitted).refined(CONVERGED)
-                if not self.beats(best, fewer) and not self.senseless(fewer):
-                    now, structures = fewer, fitted.structures
-                    break
-        now, structures = self.needed(now, best, structures)
-        now, rivals = self.exchanged(now)
-        now, structures = self.needed(now, max(now, best, key=lambda one: -one.held_out.square), structures)
-        return Answer(self.base, now, self.named(now, rivals), structures, (), self.search.trials)
-
-    def free(self, now: Explanation) -> list[str]:
-        """Return the names of the effects that were found."""
-        return [effect.name for effect in now.effects if effect.name not in self.search.fixed]
-
-    def without(self, now: Explanation, name: str) -> Explanation:
-        """Return the best joint fit of the other effects."""
-        fit = now.without(name).refined(CONVERGED)
-        names = sorted(effect.name for effect in fit.effects)
-        same = [one for one in self.search.pool.values() if sorted(effect.name for effect in one.effects) == names]
-        known = min(same, key=lambda one: one.loss.square, default=None)
-        if known is None or known.loss.square >= fit.held_out.square:
-            return fit
-        return self.rebuilt(known).refined(CONVERGED)
-
-    def senseless(self, now: Explanation) -> dict[str, float]:
-        """Return the effects that explain too little of what is there where they act, with that share."""
-        shares = {name: share(now.held_out, self.without(now, name).held_out, now.noise) for name in self.free(now)}
-        return {name: found for name, found in shares.items() if found < EXPLAINED}
-
-    def meaningful(self, now: Explanation) -> Explanation:
-        """Return a joint fit without the effects that explain too little of what is there where they act."""
-        while found := self.senseless(now):
-            now = self.without(now, min(found, key=lambda name: found[name]))
         return now
 
-    def needed(
-        self, now: Explanation, best: Explanation, structures: tuple[str, ...]
-    ) -> tuple[Explanation, tuple[str, ...]]:
-        """Return a joint fit, and its structures, without what the best one does not need."""
-        while True:
-            rest = [(self.without(now, name), structures) for name in self.free(now)]
-            for name in structures:
-                kept = tuple(other for other in structures if other != name)
-                rest.append((self.rebuilt(Fitted(tuple(now.effects), kept, now.held_out, 0)).refined(STEPS), kept))
-            spare = [one for one in rest if not self.beats(best, one[0])]
-            if not spare:
-                return now, structures
-            now, structures = min(spare, key=lambda one: (self.numbers(one[0]), one[0].held_out.square))
-
-    def exchanged(self, now: Explanation) -> tuple[Explanation, dict[str, list[tuple[str, float, bool]]]]:
-        """Return the fit with the better ones of its rivals, and for each effect the rivals, best first."""
-        rivals: dict[str, list[tuple[str, float, bool]]] = {}
-        for _ in range(MOST_EFFECTS):
-            rivals, swapped = {}, None
-            for name in self.free(now):
-                rest = self.without(now, name)
-                library = Library(rest, tuple(STRUCTURES), self.search.names)
-                size = free(now.effect(name)).size
-                present = {effect.name for effect in rest.effects}
-                singles = [form for form in library.screened((), (), present | {name}) if form.numbers <= size]
-                tried = sorted((library.choice(frozenset(), (form,)) for form in singles), key=lambda one: one.square)
-                found: list[tuple[Explanation, str]] = []
-                for choice in tried[:4]:
-                    if choice.square >= rest.held_out.square:
-                        continue
-                    first = library.fit(choice)
-                    if isinstance(first, Form):
-                        continue
-                    fit, nonsense = self.search.plausible(first.refined(CONVERGED))
-                    if not nonsense and self.numbers(fit) <= self.numbers(now):
-                        found.append((fit, choice.forms[0].name))
-                found.sort(key=lambda pair: pair[0].held_out.square)
-                rivals[name] = [(other, fit.held_out.rms, not self.beats(now, fit)) for fit, other in found]
-                if found and found[0][0].held_out.square < 0.999 * now.held_out.square:
-                    swapped = found[0][0]
-                    break
-            if swapped is None:
+    def _round(self, now: Explanation) -> Explanation:
+        """Return the best one of the sets in reach that are worth fitting, or `now`."""
+        library, best = Library(now, self.names), now
+        choices = library.choices(self.fixed)
+        self.trials = max(self.trials, independent_trials(now.held_out.blocks, [one.blocks for one in choices]))
+        tried: set[tuple[frozenset[str], frozenset[Form]]] = set()
+        for _ in range(MOST_TRIED):
+            left = (one for one in _worth_fitting(choices, now) if (one.removed, frozenset(one.forms)) not in tried)
+            if (choice := next(left, None)) is None:
                 break
-            now = swapped
-        return now, rivals
+            tried.add((choice.removed, frozenset(choice.forms)))
+            first = library.fit(choice)
+            if isinstance(first, Form):
+                library.forms.remove(first)
+                choices = library.choices(self.fixed)
+                continue
+            fit, senseless = self.sensible(first.refined(STEPS))
+            if senseless:
+                library.ban([form for form in choice.forms if form.name in senseless])
+                choices = library.choices(self.fixed)
+                # What is left of it may mean something.
+                fit, senseless = self.sensible(fit.refined(STEPS))
+                if senseless:
+                    continue
+            self._note(fit)
+            if fit.held_out.square < best.held_out.square:
+                best = fit
+        return best
 
-    def named(self, now: Explanation, rivals: dict[str, list[tuple[str, float, bool]]]) -> tuple[Named, ...]:
-        """Return the effects, each with its gain when added to the preceding ones, the largest gain first."""
-        left, taken, before, ordered = self.free(now), list(self.search.fixed), self.base.held_out, []
-        while left:
-            losses = {name: now.only([*taken, name]).held_out if len(left) > 1 else now.held_out for name in left}
-            best = min(left, key=lambda name: losses[name].square)
-            without, others = self.without(now, best).held_out, rivals.get(best, [])
-            ordered.append(
-                Named(
-                    best,
-                    before,
-                    losses[best],
-                    without,
-                    chance(now.held_out, without, self.search.trials),
-                    tuple(dict.fromkeys(name for name, _, equal in others if equal)),
-                    others[0][:2] if others else None,
-                )
-            )
-            left.remove(best)
-            taken.append(best)
-            before = losses[best]
-        return tuple(ordered)
+    def _note(self, now: Explanation) -> None:
+        fitted = Fitted.of(now)
+        key = fitted.names, fitted.numbers
+        if key not in self.pool or fitted.loss.square < self.pool[key].loss.square:
+            self.pool[key] = fitted
+
+    def sensible(self, now: Explanation) -> tuple[Explanation, list[str]]:
+        """Return a joint fit without the effects, and parts of effects, that mean nothing, and the names of effects."""
+        senseless: list[str] = []
+        for name in [effect.name for effect in now.effects if effect.name not in self.fixed]:
+            effect = now.effect(name)
+            if is_plausible(effect, now):
+                continue
+            part = effect.only_plausible(seen(now))
+            if part is not None and free(part).size:
+                fewer = now.replacing(name, part).refined(1)
+                if is_plausible(fewer.effect(name), fewer):
+                    now = fewer
+                    continue
+            senseless.append(name)
+            now = now.without(name)
+        return now, senseless
+
+
+def _worth_fitting(choices: Sequence[Choice], now: Explanation) -> list[Choice]:
+    """Return the choices with the least error of each number of forms, few forms first."""
+    most = now.held_out.square - (LEAST * now.noise) ** 2
+    better = [one for one in choices if one.forms and one.square < most]
+    return [one for count, places in PLACES for one in [each for each in better if len(each.forms) == count][:places]]

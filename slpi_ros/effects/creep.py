@@ -100,7 +100,7 @@ class Creep(EffectBase):
     )  # fmt: skip
     gain: float = parameter(
         "", "share of a step that has followed after 1 s by the power of time", 0, 1, default=0.0, instead="gains",
-        fit=Fit("linear", 1e-5, 0.0, LARGEST_SOON, absent=True),
+        fit=Fit("linear", 1e-5, 0.0, LARGEST_SOON, stays=0.0),
     )  # fmt: skip
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, field, fields, is_dataclass, replace
 from functools import cache
-from math import inf, isfinite, isinf
+from math import inf, isfinite, isinf, nan
 from textwrap import shorten
 from typing import Any, Literal, NamedTuple
 
@@ -44,8 +44,8 @@ class Fit:
     size: bool = False
     # Whether it is the state at the start of each record; an entry that is 0 stays 0.
     start: bool = False
-    # Whether 0 means that there is none, which stays so.
-    absent: bool = False
+    # Value that stays, as 0 of what is not there, or 1 of a mode that has all of the motion.
+    stays: float = nan
 
 
 @dataclass(frozen=True)
@@ -129,7 +129,9 @@ class Leaf(NamedTuple):
     def free(self) -> bool:
         """Whether it is fitted: what is not there, or an equilibrium at the start, stays as it is."""
         fit = self.facts.fit
-        return fit is not None and isfinite(self.value) and (bool(self.value) or not (fit.start or fit.absent))
+        return (
+            fit is not None and isfinite(self.value) and (bool(self.value) or not fit.start) and self.value != fit.stays
+        )
 
 
 def leaves(place: str, facts: Parameter, value: Any) -> Iterator[Leaf]:

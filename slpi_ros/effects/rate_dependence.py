@@ -114,8 +114,10 @@ class RateDependence(EffectBase):
         return changed | {"initial": tuple(0.0 if abs(lead) < NO_START else lead for lead in changed["initial"])}
 
     def plausible(self, context: FitContext) -> bool:
-        """Return whether the records reach the rate above which loops widen; below it the law is a lag, ``c / s0``."""
-        return self.onset_rate <= context.fastest
+        """Return whether the records reach the rate above which loops widen, and these by less than the range."""
+        # Below that rate the law is a lag, ``c / s0``.
+        widest = self.threshold * float(np.arcsinh(context.fastest / self.onset_rate))
+        return self.onset_rate <= context.fastest and widest <= float(np.ptp(context.v))
 
     @property
     def lasting(self) -> "RateDependence":

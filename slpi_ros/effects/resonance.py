@@ -384,10 +384,17 @@ class Resonance(EffectBase):
                     )
                     columns = [*(column(one) - columns[0] for one in near), *columns]
                 yield Candidate(np.column_stack(columns), partial(cls._if_seen, mode), positive=1)
+                if frequency not in found:
+                    # All of the motion, as of a mirror on its bearing.
+                    yield Candidate(np.column_stack(columns), partial(cls._whole, mode), positive=1, group=1)
 
     @classmethod
     def _if_seen(cls, mode: Mode, gains: FloatArray) -> "Resonance | None":
         return cls((replace(mode, gain=min(float(gains[0]), 1.0)),)) if gains[0] >= LEAST_GAIN else None
+
+    @classmethod
+    def _whole(cls, mode: Mode, gains: FloatArray) -> "Resonance | None":
+        return cls((replace(mode, gain=1.0),)) if gains[0] > 0.5 else None
 
     @property
     def dynamics(self) -> Dynamics:

@@ -56,18 +56,18 @@ class Quantity:
         "", "value at which it changes nothing, in its unit", -1e30, 1e30, default=0.0, required=True
     )
     offset_gain: float = parameter(
-        "m", "displacement for one unit", -1e6, 1e6, default=0.0, fit=Fit("linear", absent=True)
+        "m", "displacement for one unit", -1e6, 1e6, default=0.0, fit=Fit("linear", stays=0.0)
     )
     sensitivity_gain: float = parameter(
-        "", "relative change of the sensitivity for one unit", -1e6, 1e6, default=0.0, fit=Fit("linear", absent=True)
+        "", "relative change of the sensitivity for one unit", -1e6, 1e6, default=0.0, fit=Fit("linear", stays=0.0)
     )
     time_constant: float = parameter(
         "s", "time constant with which the stage follows, 0: at once", 0, 1e7, default=0.0,
-        fit=Fit("relative", least=0.1 * SHORTEST, within_record=True, absent=True),
+        fit=Fit("relative", least=0.1 * SHORTEST, within_record=True, stays=0.0),
     )  # fmt: skip
     lead: float = parameter(
         "s", "time by which the stage precedes the readings, of a sensor that is slower", 0, 1e7, default=0.0,
-        fit=Fit("relative", least=0.1 * SHORTEST, within_record=True, absent=True),
+        fit=Fit("relative", least=0.1 * SHORTEST, within_record=True, stays=0.0),
     )  # fmt: skip
     averaging: float = parameter(
         "s", "time constant of the filter of the readings in use, 0: none", 0, 1e7, default=0.0

@@ -1,0 +1,196 @@
+"""The answer of a diagnosis: the set with the fewest numbers of those that the best one does not beat."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+from slpi_ros.diagnosis.effect_parameters import free
+from slpi_ros.diagnosis.held_out import Loss
+from slpi_ros.diagnosis.joint_fit import Explanation
+from slpi_ros.diagnosis.ruler import EXPLAINED, beats, chance, share
+from slpi_ros.diagnosis.search import CONVERGED, MOST_EFFECTS, Fitted, Form, Library, Search
+from slpi_ros.diagnosis.structures import STRUCTURES
+from slpi_ros.model.axis_model import ABOVE_NOISE
+
+# Other effects that are fitted in the place of one.
+RIVALS = 4
+
+
+@dataclass(frozen=True)
+class Rival:
+    """Another effect in the place of one: what that set leaves, and whether the answer is no better."""
+
+    name: str
+    loss: Loss
+    as_good: bool
+
+
+@dataclass(frozen=True)
+class Named:
+    """An effect of the answer, with what the effects before it leave, without it and with it."""
+
+    name: str
+    before: Loss
+    after: Loss
+    # What all others leave, and the probability that chance makes the set with it so much better.
+    without: Loss
+    p_value: float
+    # Other effects in its place, in sets of no more numbers, the best one first.
+    rivals: tuple[Rival, ...]
+
+    @property
+    def alternatives(self) -> tuple[str, ...]:
+        """Names of the effects that may stand in its place."""
+        return tuple(dict.fromkeys(one.name for one in self.rivals if one.as_good))
+
+
+@dataclass(frozen=True)
+class Answer:
+    """The set of effects that a diagnosis gives: joint fit without and with it."""
+
+    base: Explanation
+    now: Explanation
+    # The largest gain first; each gain is relative to the preceding effects.
+    named: tuple[Named, ...] = ()
+    # Defects of the hysteresis model: `BIAS`, or keys of `STRUCTURES`.
+    structures: tuple[str, ...] = ()
+    # Effects that were found, and make a record worse or another hysteresis unnecessary.
+    dropped: tuple[str, ...] = ()
+
+    def without_last(self) -> "Answer":
+        """Return the answer without the effect that gains least."""
+        *named, last = self.named
+        now = self.now.without(last.name).refined(CONVERGED) if named else self.base
+        kept = tuple(replace(one, without=now.without(one.name).held_out) for one in named)
+        return replace(self, now=now, named=kept, dropped=tuple(sorted({*self.dropped, last.name})))
+
+
+class Judge:
+    """Choice of the answer among the sets of a search."""
+
+    def __init__(self, search: Search) -> None:
+        self._search, self._base, self._noise = search, search.base, search.base.noise
+
+    def answer(self) -> Answer:
+        """Return the answer."""
+        now = self._search.run()
+        self._noise = now.noise
+        best = now = self._meaningful(now)
+        for fitted in sorted(self._search.pool.values(), key=lambda one: (one.numbers, one.loss.square)):
+            if fitted.numbers >= Fitted.of(now).numbers:
+                break
+            if not self._beats(best.held_out, fitted.loss):
+                fewer = self._rebuilt(fitted)
+                if not self._beats(best.held_out, fewer.held_out) and not self._senseless(fewer):
+                    now = fewer
+                    break
+        now, rivals = self._exchanged(self._needed(now, best))
+        now = self._needed(now, min(now, best, key=lambda one: one.held_out.square))
+        named = self._named(now, rivals)
+        return self._beside_structures(Answer(self._base, now, named))
+
+    def _beats(self, one: Loss, other: Loss) -> bool:
+        return beats(one, other, self._noise, self._search.trials)
+
+    def _rebuilt(self, fitted: Fitted) -> Explanation:
+        return Explanation(self._base.evidence, fitted.effects, self._base).refined(CONVERGED)
+
+    def _free(self, now: Explanation) -> list[str]:
+        """Return the names of the effects that were found."""
+        return [effect.name for effect in now.effects if effect.name not in self._search.fixed]
+
+    def _without(self, now: Explanation, name: str) -> Explanation:
+        """Return the best joint fit of the other effects."""
+        fit = now.without(name).refined(CONVERGED)
+        same = [one for one in self._search.pool.values() if one.names == Fitted.of(fit).names]
+        known = min(same, key=lambda one: one.loss.square, default=None)
+        return fit if known is None or known.loss.square >= fit.held_out.square else self._rebuilt(known)
+
+    def _senseless(self, now: Explanation) -> dict[str, float]:
+        """Return the effects that explain too little of what is there where they act, with that share."""
+        shares = {name: share(now.held_out, self._without(now, name).held_out, now.noise) for name in self._free(now)}
+        if len(now.evidence.parts) == 1 and now.held_out.rms > ABOVE_NOISE * now.noise:
+            # A free course of one record is refuted by nothing but what it leaves.
+            shares |= {name: -1.0 for name in shares if now.effect(name).courses}
+        return {name: found for name, found in shares.items() if found < EXPLAINED}
+
+    def _meaningful(self, now: Explanation) -> Explanation:
+        while found := self._senseless(now):
+            now = self._without(now, min(found, key=lambda name: found[name]))
+        return now
+
+    def _needed(self, now: Explanation, best: Explanation) -> Explanation:
+        """Return a joint fit without the effects that the best one does not need."""
+        while True:
+            rest = [self._without(now, name) for name in self._free(now)]
+            spare = [one for one in rest if not self._beats(best.held_out, one.held_out)]
+            if not spare:
+                return now
+            now = min(spare, key=lambda one: (Fitted.of(one).numbers, one.held_out.square))
+
+    def _exchanged(self, now: Explanation) -> tuple[Explanation, dict[str, tuple[Rival, ...]]]:
+        """Return the fit with the better ones of the rivals of its effects, and for each effect the others."""
+        rivals: dict[str, tuple[Rival, ...]] = {}
+        for _ in range(MOST_EFFECTS):
+            better = None
+            for name in self._free(now):
+                found = self._in_its_place(now, name)
+                rivals[name] = tuple(
+                    Rival(other, fit.held_out, not self._beats(now.held_out, fit.held_out)) for other, fit in found
+                )
+                if found and found[0][1].held_out.square < now.held_out.square:
+                    better = found[0][1]
+                    break
+            if better is None:
+                break
+            now = better
+        return now, rivals
+
+    def _in_its_place(self, now: Explanation, name: str) -> list[tuple[str, Explanation]]:
+        """Return the joint fits with another effect, of no more numbers, in the place of one, the best one first."""
+        rest, most = self._without(now, name), free(now.effect(name)).size
+        library = Library(rest, self._search.names)
+        present = {effect.name for effect in rest.effects}
+        singles = [form for form in library.screened((), (), present | {name}) if form.numbers <= most]
+        choices = sorted((library.choice(frozenset(), (form,)) for form in singles), key=lambda one: one.square)
+        found = []
+        for choice in [one for one in choices if one.square < rest.held_out.square][:RIVALS]:
+            first = library.fit(choice)
+            if isinstance(first, Form):
+                continue
+            fit, senseless = self._search.sensible(first.refined(CONVERGED))
+            if not senseless and Fitted.of(fit).numbers <= Fitted.of(now).numbers:
+                found.append((choice.forms[0].name, fit))
+        return sorted(found, key=lambda pair: pair[1].held_out.square)
+
+    def _named(self, now: Explanation, rivals: dict[str, tuple[Rival, ...]]) -> tuple[Named, ...]:
+        """Return the effects, each with its gain when added to the preceding ones, the largest gain first."""
+        left, taken, before, ordered = self._free(now), list(self._search.fixed), self._base.held_out, []
+        while left:
+            losses = {name: now.only([*taken, name]).held_out if len(left) > 1 else now.held_out for name in left}
+            best = min(left, key=lambda name: losses[name].square)
+            without = self._without(now, best).held_out
+            p_value = chance(now.held_out, without, self._search.trials)
+            ordered.append(Named(best, before, losses[best], without, p_value, rivals.get(best, ())))
+            left.remove(best)
+            taken.append(best)
+            before = losses[best]
+        return tuple(ordered)
+
+    def _beside_structures(self, answer: Answer) -> Answer:
+        """Return the answer with the defect of the hysteresis that is seen beside it, or instead of it."""
+        if self._search.names is not None:
+            return answer
+        now, found = answer.now, list[tuple[float, str]]()
+        for name, columns in STRUCTURES.items():
+            if answer.named and not self._beats(now.held_out, self._base.beside(columns(self._base)).held_out):
+                dropped = tuple(sorted(one.name for one in answer.named))
+                return Answer(self._base, self._base, structures=(name,), dropped=dropped)
+            with_it = now.beside(columns(now)).held_out
+            if self._beats(with_it, now.held_out):
+                found.append((with_it.square, name))
+        return replace(answer, structures=(min(found)[1],)) if found else answer
+
+
+def answer_of(base: Explanation, names: Sequence[str] | None = None) -> Answer:
+    """Return the answer for a joint fit without effects, of all effects or of those with these `names`."""
+    return Judge(Search(base, names)).answer()

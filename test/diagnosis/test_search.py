@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter, lfilter_zi
 
+from slpi_ros.diagnosis.answer import Judge, answer_of
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part
-from slpi_ros.diagnosis.search import Form, Judge, Library, Search
+from slpi_ros.diagnosis.ruler import beats
+from slpi_ros.diagnosis.search import Fitted, Form, Library, Search
 from slpi_ros.effects.base import Candidate
 from slpi_ros.identification.bases import SurfaceBasis
 
@@ -48,19 +50,19 @@ def names(now):
 @pytest.fixture(scope="module")
 def both():
     """Search a record of a stage that lags, with a hum."""
-    judge = Judge(Search(fit(LAG, HUM[1]), NAMES))
-    return judge, judge.answer()
+    search = Search(fit(LAG, HUM[1]), NAMES)
+    return search, Judge(search).answer()
 
 
 def test_a_pair_is_found_with_its_parameters(both):
-    judge, answer = both
+    search, answer = both
     assert {one.name for one in answer.named} == names(answer.now) == {"lag", "hum"}
     lag, hum = answer.now.effect("lag"), answer.now.effect("hum")
     assert lag.time_constant == pytest.approx(LAG, rel=0.05)
     (line,) = hum.lines
     assert (line.frequency, line.amplitude) == pytest.approx(HUM, rel=0.05)
     assert answer.now.noise == pytest.approx(NOISE, rel=0.1)
-    assert judge.search.trials > 1.0 and not answer.structures
+    assert search.trials > 1.0 and not answer.structures
 
 
 def test_each_gain_is_relative_to_the_preceding_effects(both):
@@ -73,26 +75,28 @@ def test_each_gain_is_relative_to_the_preceding_effects(both):
 
 
 def test_the_answer_is_in_the_pool_of_the_search_and_no_smaller_set_is_as_good(both):
-    judge, answer = both
-    smaller = [one for one in judge.search.pool.values() if one.numbers < judge.numbers(answer.now)]
-    assert smaller and all(judge.beats(answer.now, one) for one in smaller)
+    search, answer = both
+    smaller = [one for one in search.pool.values() if one.numbers < Fitted.of(answer.now).numbers]
+    noise = answer.now.noise
+    assert smaller and all(beats(answer.now.held_out, one.loss, noise, search.trials) for one in smaller)
 
 
 def test_nothing_is_found_where_nothing_is():
-    answer = Judge(Search(fit(), NAMES)).answer()
+    answer = answer_of(fit(), NAMES)
     assert not answer.named and not answer.now.effects
 
 
 def test_a_delay_is_judged_in_the_place_of_a_lag(both):
     _, answer = both
     lag = next(one for one in answer.named if one.name == "lag")
-    assert lag.runner_up and lag.runner_up[0] in NAMES and lag.runner_up[1] > answer.now.held_out.rms
+    assert "delay" in {rival.name for rival in lag.rivals}
+    assert all(rival.loss.rms > answer.now.held_out.rms for rival in lag.rivals)
     assert not lag.alternatives
 
 
 def test_sets_are_compared_to_first_order_as_after_a_refit():
     now = fit(drift=2e-7)
-    library = Library(now, (), ("thermal_drift",))
+    library = Library(now, ("thermal_drift",))
     # A drift is linear in all its numbers, so that first order is exact.
     form = min(library.forms, key=lambda one: one.numbers)
     assert isinstance(form.candidate, Candidate)
@@ -107,7 +111,7 @@ def test_sets_are_compared_to_first_order_as_after_a_refit():
 @pytest.mark.parametrize("records", [1, 2])
 def test_a_small_lag_is_compared_nearly_as_after_a_refit(records):
     now = fit(0.003, records=records)
-    library = Library(now, (), ("lag",))
+    library = Library(now, ("lag",))
     best = min((library.choice(frozenset(), (form,)) for form in library.forms), key=lambda one: one.square)
     refitted = library.fit(best)
     assert not isinstance(refitted, Form)
@@ -119,7 +123,7 @@ def test_a_small_lag_is_compared_nearly_as_after_a_refit(records):
 
 def test_a_set_without_one_of_its_effects_is_compared_as_after_a_refit(both):
     _, answer = both
-    library = Library(answer.now, (), ())
+    library = Library(answer.now, ())
     for name in ("lag", "hum"):
         left = library.choice(frozenset({name}), ()).square
         assert left == pytest.approx(answer.now.without(name).held_out.square, rel=0.1)
@@ -127,7 +131,7 @@ def test_a_set_without_one_of_its_effects_is_compared_as_after_a_refit(both):
 
 def test_the_forms_that_explain_most_are_screened_first(both):
     _, answer = both
-    library = Library(answer.now.without("lag"), (), NAMES)
+    library = Library(answer.now.without("lag"), NAMES)
     found = [form.name for form in library.screened(frozenset(), (), {"hum"})]
     assert "lag" in found[:2] and "hum" not in found
     library.ban([form for form in library.forms if form.name == "lag"])

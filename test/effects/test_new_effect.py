@@ -9,10 +9,10 @@ import pytest
 from effects.supply_sag import SupplySag
 
 import slpi_ros
+from slpi_ros.diagnosis.answer import answer_of
 from slpi_ros.diagnosis.effect_parameters import bounded, free, moved, names, steps
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import evidence_of
-from slpi_ros.diagnosis.search import Judge, Search
 from slpi_ros.effects import registry
 from slpi_ros.errors import ModelError
 from slpi_ros.excitation.drives import calibration_drive, excite
@@ -68,10 +68,10 @@ def test_it_is_found_fitted_described_saved_and_loaded(record, tmp_path):
 
 def test_its_plausibility_is_asked(record, monkeypatch):
     fit = Explanation(evidence_of([record], "x", slpi_ros.identify(record).axes["x"]))
-    (one,) = Judge(Search(fit, [NAME])).answer().now.effects
+    (one,) = answer_of(fit, [NAME]).now.effects
     assert one.gain == pytest.approx(GAIN, rel=0.1)
     monkeypatch.setattr("effects.supply_sag.LARGEST", 1e-6)
-    assert not Judge(Search(fit, [NAME])).answer().now.effects
+    assert not answer_of(fit, [NAME]).now.effects
 
 
 def test_its_parameters_are_checked_and_fitted_as_its_fields_say():

@@ -509,7 +509,7 @@ def why(verified: Sequence[Mapping[str, TrackingError]], diagnosis: Diagnosis, e
     effects: Sequence[Effect] = [each.effect for each in diagnosis.axes[name].effects]
     lasting = [effect.name for effect in effects if effect.needs_feedback]
     if lasting:
-        said.append(f"{', '.join(lasting)} cannot be undone without feedback and will go on")
+        said.append(f"{', '.join(lasting)} cannot be compensated without feedback")
     if abs(worst.offset) > worst.rest:
         creeps = any(effect.resembles_when_old for effect in effects)
         said.append(

@@ -27,7 +27,8 @@ NOISE_FLOOR = "[...document.querySelectorAll('#x-frequency .js-line')].at(-1).st
 BESIDE = """(([a, b]) => a.getBoundingClientRect().top === b.getBoundingClientRect().top)(
   [...document.querySelectorAll('#x-loops .nsewdrag')])"""
 # What is beyond the window, what is read by scrolling within the page, and the smallest letters, pixels.
-BEYOND = "[...document.querySelectorAll('body *')].filter(e => e.getBoundingClientRect().right > innerWidth + 1).length"
+BEYOND = """[...document.querySelectorAll('body *:not(svg *)')].filter(
+  e => e.getBoundingClientRect().right > innerWidth + 1).length"""
 SCROLLED = "[...document.querySelectorAll('.scroll')].filter(e => e.scrollWidth > e.clientWidth).length"
 LETTERS = """Math.min(...[...document.querySelectorAll('body *:not(script)')].filter(
   e => e.checkVisibility() && [...e.childNodes].some(part => part.nodeType === 3 && part.data.trim())).map(
@@ -93,8 +94,8 @@ def test_paper_holds_all(browser, pages, name):
     look(browser, PAPER_WIDTH, "light", pages[name])
     browser.call("Emulation.setEmulatedMedia", media="print")
     browser.run("window.dispatchEvent(new Event('beforeprint'))")
-    lower = f"[...document.querySelectorAll('figure.chart')].every(e => 2 * e.clientHeight <= {PAPER_HEIGHT})"
-    browser.until(f"{lower} && {BEYOND} === 0")
+    fits = f"[...document.querySelectorAll('figure.chart')].every(e => e.clientHeight <= {PAPER_HEIGHT})"
+    browser.until(f"{fits} && {BEYOND} === 0")
     assert browser.run(SCROLLED) == 0
     whole = "[...document.querySelectorAll('figure.chart')].every(e => getComputedStyle(e).breakInside === 'avoid')"
     # Else each chart would have to be on the page of the next one, and would be split.

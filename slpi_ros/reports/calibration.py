@@ -92,7 +92,7 @@ def _errors(outcome: Outcome) -> list[list[str]]:
             *map(length, (error.maximum, error.offset, error.rest)),
         ]
         for number, step in enumerate(step for step in outcome.steps if step.errors)
-        for axis, error in step.errors.items()
+        for axis, error in (step.errors or {}).items()
     ]
 
 

@@ -42,7 +42,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test test-long test-jazzy test-newest test-kilted test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-recorder bench-oscillation bench-tune bench-export bench-coverage bench-identification test-export-arm bench-company FORCE
+.PHONY: help build test test-long test-jazzy test-newest test-kilted test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-twins bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-recorder bench-oscillation bench-tune bench-export bench-coverage bench-identification test-export-arm bench-company FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -87,12 +87,13 @@ help:
 	@echo 'make bench-rate-law  the rate law: round trips, cost, and what it predicts of measured records, 15 minutes'
 	@echo 'make bench-foreign   stages whose physics is not that of the package: PI, SLPI, SLPI with causes; 15 minutes'
 	@echo 'make bench-no-harm   the same on measured records that were not fitted, of other actuators too; 15 minutes'
-	@echo 'make bench-measured   every measured record, thirteen methods: table, picture, README; an hour'
+	@echo 'make bench-measured   every measured record, thirteen methods: table, picture, README; 45 minutes'
+	@echo 'make bench-twins       the methods of bench-measured beside second implementations; half an hour'
 	@echo 'make bench-agreement  200 hostile bags: command line, identify node and fleet decide the same; 3 minutes'
 	@echo 'make bench-confusion   effects, pairs, clean stages and causes that no effect describes: wrong or silent; an hour'
 	@echo 'make bench-calibrator  the calibrator on 20 hidden stages, and 30 faults; an hour'
 	@echo 'make bench-promise     the error that the calibrator promises on 20 stages, and that of scans later; half an hour'
-	@echo 'make bench-coverage   true errors within two standard uncertainties, by horizon; COVERAGE="--stages 100"; 20 minutes'
+	@echo 'make bench-coverage   true errors within two standard uncertainties, and how large these are, by horizon; COVERAGE="--stages 100"; 20 minutes'
 	@echo 'make bench-fleet    300 bags of 30 stages on Dask: changes found, one worker beside two, 20 minutes'
 	@echo 'make bench-export   the exported C inverse beside the stream of Python: agreement, time, memory; a few minutes'
 	@echo 'make test-export-arm  the exported C inverse on simulated Cortex-M4F and M7; as root it installs the tools (apt, 1 GB)'
@@ -246,6 +247,10 @@ bench-no-harm: build
 bench-measured: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) -m benchmarks.measured.bench --keep
 	$(VENV) -m benchmarks.measured.report
+	$(VENV) -m benchmarks.measured.loop
+
+bench-twins: build
+	OPENBLAS_NUM_THREADS=1 $(VENV) -m benchmarks.measured.twins
 
 bench-agreement: build
 	$(IN_WORKSPACE) PYTHONPATH=.:test OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/agreement.py

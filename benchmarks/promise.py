@@ -68,7 +68,9 @@ class Operation:
         longest = max(map(len, paths))
         desired = np.column_stack([np.pad(path, (0, longest - path.size), mode="edge") for path in paths])
         rows, t = [], []
-        for row in desired.tolist():
+        times = np.arange(longest) / RATE
+        asked = [self.model.axis(name).in_advance(times, y) for name, y in zip(self.axes, desired.T, strict=True)]
+        for row in np.column_stack(asked).tolist():
             self.controller.update(self._ns, self.axes, row, self._ns)
             rows.append(self._step())
             t.append(self.bench.now)

@@ -31,12 +31,17 @@ EXECUTABLES = (
 
 
 @contextmanager
-def executable(name: str, *, log: str = "warn", **parameters: str | float | bool) -> Iterator[subprocess.Popen[bytes]]:
-    """Run one of the package's nodes until the block ends; it gets the time to finish its work."""
+def executable(
+    name: str, *, log: str = "warn", listen: bool = False, **parameters: str | float | bool
+) -> Iterator[subprocess.Popen[bytes]]:
+    """Run one of the package's nodes until the block ends; it gets the time to finish its work.
+
+    With `listen` its log is at ``stderr`` of the process, to be read to the end.
+    """
     command = [str(EXECUTABLES / name), "--ros-args", "--log-level", log]
     for key, value in parameters.items():
         command += ["-p", f"{key}:={value}"]
-    process = subprocess.Popen(command, start_new_session=True)
+    process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE if listen else None)
     try:
         yield process
     finally:
@@ -57,6 +62,7 @@ class Operator(Node):
         self.voltage = self.create_publisher(Float64MultiArray, "voltage_command", QOS)
         self.desired = self.create_publisher(JointState, "desired_displacement", QOS)
         self._answers: list[tuple[float, float]] = []
+        self.late = 0  # messages of the last path
         self.state = JointState()
         self.create_subscription(JointState, "stage_state", self._keep, QOS)
         self._reports: list[dict[str, str]] = []
@@ -115,7 +121,7 @@ class Operator(Node):
 
     def _send(self, messages: Sequence[Any], publish: Callable[[Any], None], rate: float) -> FloatArray:
         """Return the last answer to each message: while the compensator holds or slews there are several."""
-        kept = []
+        kept, self.late = [], 0
         due, begin = time.monotonic(), self.get_clock().now() - Duration(seconds=time.monotonic())
         for k, message in enumerate(messages):
             time.sleep(max(0.0, due - time.monotonic()))
@@ -124,7 +130,8 @@ class Operator(Node):
                 kept.append(self._answers[-1])
             # On a busy machine the path is followed more slowly, and its stamps say so.
             now = time.monotonic()
-            due = now if now > due + 1.0 / rate else due
+            if now > due + 1.0 / rate:
+                due, self.late = now, self.late + 1
             if isinstance(message, JointState):
                 # The time at which it is meant: those at which messages are sent are less even.
                 message.header.stamp = (begin + Duration(seconds=due)).to_msg()

@@ -96,12 +96,16 @@ class MeasuredRecord:
 
 @dataclass(frozen=True)
 class Span:
-    """A part of a record, from `start` to before `stop`, s; by default all of it. `name`: for the tables."""
+    """A part of a record, from `start` to before `stop`, s; by default all of it.
+
+    For the tables: its `name`, and `why` a model of hysteresis can be worse there than a straight line.
+    """
 
     record: str
     start: float = 0.0
     stop: float = math.inf
     name: str = ""
+    why: str = ""
 
     def __post_init__(self) -> None:
         _require(0.0 <= self.start < self.stop, f"{self.record}: from {self.start} to {self.stop} s is no time span")

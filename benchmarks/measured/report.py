@@ -8,7 +8,8 @@ Writes what stands between marks in README.md and in measured.md and figures.md 
 
 import argparse
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -67,32 +68,75 @@ def readme_table(rows: Rows, manifest: Manifest, date: str, command: str) -> str
         best = min(others, key=lambda other: float(others[other]["rms"]))
         cells.append(f"{_cell(others[best], marked.get(best, ''))} {best}")
         lines.append(f"| {name} | {' | '.join(cells)} |")
-    ours = [[marks(row).get(column, "") for column in ("SLPI", "SLPI, causes")] for row in rows.values()]
-    wins, near = sum("*" in found for found in ours), sum(any(found) for found in ours)
     count = max(len(row) for row in rows.values())
     said = (
         f"Rms error of the model from voltages alone, without its mean, on data that were not fitted, in % of their "
         f"range; {date}, `{command}`. **Bold**: the best of {count} methods; *equal*: not significantly worse than the "
         f"best (95 %). A device whose motion was measured has one row: the one with the median ratio of *SLPI, causes* "
-        f"to the best other method, of two the worse one. [All {len(rows)} rows, all methods]"
-        f"(docs/explanation/measured.md): SLPI, with or without causes, is the best in {wins}, and the best or equal "
-        f"in {near}. {_cost(rows)}"
+        f"to the best other method, of two the worse one.\n\n{headline(rows)} [All {len(rows)} rows, all methods]"
+        f"(docs/explanation/measured.md)."
     )
     return "\n".join([*lines, "", said])
 
 
-def _cost(rows: Rows) -> str:
-    """Return a sentence with the median gain over the classical models, and what it costs."""
-    ours = [row["SLPI, causes"] for row in rows.values()]
-    gains = [
-        np.median([row[other]["rms"] / row["SLPI, causes"]["rms"] for row in rows.values() if "rms" in row[other]])
-        for other in ("PI", "PI, lag")
-    ]
-    fit, sample = (np.median([cell[key] for cell in ours]) for key in ("fit_seconds", "sample_microseconds"))
+@dataclass(frozen=True)
+class Comparison:
+    """Errors of SLPI with causes over those of another method, row by row: without the mean error, and with it."""
+
+    ratios: tuple[float, ...]
+    absolute: tuple[float, ...]
+    wins: int  # significantly less, 95 %
+    losses: int
+
+    def __str__(self) -> str:
+        """Return the figures in words."""
+        ties = len(self.ratios) - self.wins - self.losses
+        return (
+            f"median {np.median(self.ratios):.2f}, worst {max(self.ratios):.2f} (with the mean errors "
+            f"{np.median(self.absolute):.2f} and {max(self.absolute):.2f}); significantly less in {self.wins} rows, "
+            f"equal in {ties}, more in {self.losses}"
+        )
+
+
+def compared(rows: Rows, others: Sequence[str] = ()) -> Comparison:
+    """Compare SLPI with causes with the best of `others` in each row; by default of all methods that are not SLPI."""
+    ratios, absolute, wins, losses = [], [], 0, 0
+    for row in rows.values():
+        ours = row["SLPI, causes"]
+        rivals = [cell for name, cell in row.items() if _other(name, cell) and (name in others or not others)]
+        if "rms" not in ours or not rivals:
+            continue
+        best = min(rivals, key=lambda cell: float(cell["rms"]))
+        ratios.append(ours["rms"] / best["rms"])
+        absolute.append(ours["absolute"] / min(float(cell["absolute"]) for cell in rivals))
+        wins += ours["rms"] < best["low"]
+        losses += best["rms"] < ours["low"]
+    return Comparison(tuple(ratios), tuple(absolute), wins, losses)
+
+
+def headline(rows: Rows) -> str:
+    """Return sentences with the ratios to the best other method of each row and to the classical models."""
+    cells = [row["SLPI, causes"] for row in rows.values() if "rms" in row["SLPI, causes"]]
+    fit, sample = (np.median([cell[key] for cell in cells]) for key in ("fit_seconds", "sample_microseconds"))
     return (
-        f"In the median row the error of the classical model PI is {gains[0]:.1f} times that of *SLPI, causes*, that "
-        f"of PI with a lag {gains[1]:.1f} times; the fit takes {fit:.0f} s on one core, a sample {sample:.1f} µs."
+        f"Error of *SLPI, causes* in all {len(rows)} rows, over that of the best **other** method, chosen afterwards "
+        f"for each row: {compared(rows)}. Over that of PI: {compared(rows, ['PI'])}. Over that of PI with a "
+        f"lag: {compared(rows, ['PI, lag'])}. A fit takes {fit:.0f} s on one core, a sample {sample:.1f} µs (medians)."
     )
+
+
+def worse_than_line(rows: Rows, manifest: Manifest) -> list[str]:
+    """Return the lines of a table: where methods are worse than a straight line, by how much, and why."""
+    lines = ["| row | line | worse | why |", "|---|---|---|---|"]
+    for task in manifest.tasks:
+        for part in task.judged:
+            row = rows[label := f"{task.name}: {part}"]
+            least = float(row["line"]["rms"])
+            worse = {name: cell["rms"] for name, cell in row.items() if "rms" in cell and cell["rms"] > least}
+            if worse:
+                found = ", ".join(f"{name} {rms:.3f}" for name, rms in worse.items())
+                lines.append(f"| {label} | {least:.3f} | {found} | {part.why} |")
+    return lines
 
 
 def what_is_judged(manifest: Manifest) -> list[str]:
@@ -113,6 +157,7 @@ def full_tables(rows: Rows, manifest: Manifest, date: str, command: str) -> str:
     for title, figure, text in (
         ("Without the mean error", "rms", "{0[rms]:.3f} ({0[low]:.3f} to {0[high]:.3f})"),
         ("With the mean error", "absolute", "{0[absolute]:.3f}"),
+        ("On the fitted records, without the mean error", "fitted", "{0[fitted]:.3f}"),
         ("Inverse: error of the voltage, % of its range", "inverse", "{0[inverse]:.3f}"),
         ("Processor time of the fit, s", "fit_seconds", "{0[fit_seconds]:.1f}"),
         ("Processor time of a sample, µs", "sample_microseconds", "{0[sample_microseconds]:.2f}"),
@@ -125,6 +170,7 @@ def full_tables(rows: Rows, manifest: Manifest, date: str, command: str) -> str:
             cells = [text.format(row[name]) if name in known else absent[name] for name in names]
             cells = [f"**{cell}**" if name == best else cell for name, cell in zip(names, cells, strict=True)]
             parts.append(f"| {label} | {' | '.join(cells)} |")
+    parts += ["", "### Worse than a straight line", "", *worse_than_line(rows, manifest)]
     return "\n".join(parts)
 
 

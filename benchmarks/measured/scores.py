@@ -11,7 +11,16 @@ from numpy.typing import NDArray
 from scipy.signal import savgol_filter
 
 from benchmarks.measured.manifest import Span, Task
-from benchmarks.measured.methods import Fitted, Invertible, Method, Series, possible_histories
+from benchmarks.measured.methods import (
+    Fitted,
+    Invertible,
+    Method,
+    Series,
+    chosen_history,
+    likely_history,
+    possible_histories,
+)
+from benchmarks.measured.methods.operators import plays
 from slpi_ros.errors import SlpiError
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.io.record import Record
@@ -20,8 +29,9 @@ from slpi_ros.io.tables import import_table
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-# A record that was not fitted: the share of its judged part by which the history is chosen, and which is not judged.
-WARM_UP = 0.1
+# A record that was not fitted: its beginning, until the voltage has gone this share of its way, chooses the history and
+# is not judged. A hold says nothing of the history, nor do moves within this share of the range, noise for example.
+WARM_UP, STANDS = 0.1, 0.005
 # A measured displacement is smoothed before it is inverted, by polynomials of degree 2 over this share of a move from
 # turn to turn, at least so many samples. Turns of less than a share of the range do not count.
 SMOOTHED, FEWEST, SMALLEST = 0.05, 5, 0.02
@@ -43,6 +53,8 @@ class Score:
         Rms error with its mean.
     fit_seconds, sample_microseconds : float
         Processor time of the fit, and of a free run for each sample.
+    fitted : float
+        Free-run error on the records of the fit, each without its mean, % of its range.
     inverse : float, optional
         Rms error of the voltage that the inverse gives for the measured displacement, smoothed and without the mean
         error of the free run, % of the range of the voltage. None without an inverse.
@@ -56,6 +68,7 @@ class Score:
     absolute: float
     fit_seconds: float
     sample_microseconds: float
+    fitted: float
     inverse: float | None = None
     said: str = ""
 
@@ -87,7 +100,7 @@ def fitted_series(tables: Tables, task: Task) -> list[Series]:
         one = tables.series(name, task.axis, task.fitted)
         # A method that looks beyond its part shall find nothing there.
         found.append(Series(name, one.t, one.v, np.where(one.fitted, one.y, np.nan), one.fitted))
-    return found
+    return [replace(one, history=likely_history(found, one)) for one in found]
 
 
 def interval(error: FloatArray, seed: int = 0) -> tuple[float, float]:
@@ -104,8 +117,9 @@ def interval(error: FloatArray, seed: int = 0) -> tuple[float, float]:
 def score(tables: Tables, task: Task, method: Method) -> dict[str, Score | str]:
     """Fit a method, and return its errors on each judged part by name; the reason where it refuses.
 
-    The state at the start of a record is unknown to every method: of the same three histories each has the one with the
-    least error on samples that are not judged: the fitted part of the same record, or the first tenth of another one.
+    The state at the start of a record is unknown to every method. It is chosen as in ``slpi verify``, see
+    `chosen_history`, but by samples that are not judged: the fitted part of the same record, or the beginning of
+    another one.
     """
     records = fitted_series(tables, task)
     began = time.process_time()
@@ -116,18 +130,29 @@ def score(tables: Tables, task: Task, method: Method) -> dict[str, Score | str]:
     except (SlpiError, ValueError, np.linalg.LinAlgError) as error:
         return {str(span): f"{type(error).__name__}: {error}" for span in task.judged}
     took = time.process_time() - began
-    return {str(span): _judged(model, tables, task, span, records, took) for span in task.judged}
+    fitted = _fitted(model, records)
+    return {str(span): _judged(model, tables, task, span, records, took, fitted) for span in task.judged}
+
+
+def _fitted(model: Fitted, records: Sequence[Series]) -> float:
+    """Return the error on the fitted samples, %."""
+    errors = []
+    for one in records:
+        y = one.y[one.fitted]
+        error = (free_run(model, one, records)[0][one.fitted] - y)[np.isfinite(y)]
+        errors.append((error - np.mean(error)) / float(np.nanmax(y) - np.nanmin(y)))
+    return 100.0 * float(np.std(np.concatenate(errors)))
 
 
 def _judged(
-    model: Fitted, tables: Tables, task: Task, span: Span, records: Sequence[Series], took: float
+    model: Fitted, tables: Tables, task: Task, span: Span, records: Sequence[Series], took: float, fitted: float
 ) -> Score | str:
     one = tables.series(span.record, task.axis, [span])
     try:
         run, history, seconds = free_run(model, one, records)
     except SlpiError as refusal:
         return f"{type(refusal).__name__}: {refusal}"
-    judged = _split(one, records)[1]
+    judged = split(one, records)[1]
     error = (run - one.y)[judged]
     share = 100.0 / float(np.ptp(one.y[judged]))
     mean = float(np.mean(error))
@@ -139,6 +164,7 @@ def _judged(
         absolute=share * float(np.sqrt(np.mean(error**2))),
         fit_seconds=took,
         sample_microseconds=1e6 * seconds / one.t.size,
+        fitted=fitted,
         inverse=_inverse(model, replace(one, y=one.y + mean), judged, history),
         said=str(getattr(model, "said", "")),
     )
@@ -146,28 +172,33 @@ def _judged(
 
 def free_run(model: Fitted, one: Series, records: Sequence[Series]) -> tuple[FloatArray, tuple[float, ...], float]:
     """Return the free run of a judged record (N,), its history, V, and the least processor time of one, s."""
-    chooses, _ = _split(one, records)
-    runs, seconds = [], []
-    histories = possible_histories(records)
-    for history in histories:
+    chooses, _ = split(one, records)
+    runs, seconds = {}, []
+    v = float(one.v[np.isfinite(one.v)][0])
+    for history in possible_histories(records, v):
         began = time.process_time()
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            runs.append(model.simulate(one.name, one.t, one.v, history))
+            runs[history] = model.simulate(one.name, one.t, one.v, history)
         seconds.append(time.process_time() - began)
-    best = min(range(len(runs)), key=lambda k: float(np.std((runs[k] - one.y)[chooses])))
-    return runs[best], histories[best], min(seconds)
+    errors = [float(np.std((runs[history] - one.y)[chooses])) for history in possible_histories(records, v)]
+    rested = getattr(model, "rested", not records[0].history)
+    chosen = chosen_history(records, v, errors, rested=rested and bool(np.isclose(v, records[0].v[0])))
+    return runs[chosen], chosen, min(seconds)
 
 
-def _split(one: Series, records: Sequence[Series]) -> tuple[Mask, Mask]:
+def split(one: Series, records: Sequence[Series]) -> tuple[Mask, Mask]:
     """Return the samples of a judged record that choose its history, and those that are judged."""
     judged = one.fitted & np.isfinite(one.y)
     for record in records:
         if record.name == one.name:
             return record.fitted & np.isfinite(record.y), judged
-    warm_up = np.zeros_like(judged)
-    warm_up[np.flatnonzero(judged)[: int(np.ceil(WARM_UP * judged.sum()))]] = True
-    return warm_up, judged & ~warm_up
+    known = np.isfinite(one.v)
+    v = np.interp(one.t, one.t[known], one.v[known])
+    moved = plays(v, np.array([STANDS * float(np.ptp(v))]), np.arange(v.size))[:, 0]
+    way = np.cumsum(np.where(judged, np.abs(np.diff(moved, prepend=moved[0])), 0.0))
+    begins = way <= WARM_UP * way[-1]
+    return judged & begins, judged & ~begins
 
 
 def _window(one: Series) -> int:

@@ -162,6 +162,14 @@ def tendon(files: Sequence[bytes]) -> Lines:
         yield f"{row[0]:.5f},{row[1]:.5f},{row[6]:.5f}"
 
 
+def mirror(files: Sequence[bytes]) -> Lines:
+    """Read a capture of a dSPACE system: time (s), amplifier output, LVDT with its sign turned, amplifier input (V)."""
+    (capture,) = (value for name, value in _matlab(files[0]).items() if not name.startswith("__"))
+    _, sensor, drive = (np.asarray(signal.Data, dtype=np.float64) for signal in capture.Y)
+    for t, v, y in zip(np.asarray(capture.X.Data, dtype=np.float64), drive, -sensor, strict=True):
+        yield f"{t:.6f},{v:.8g},{y:.8g}"
+
+
 EXTRACTIONS: Mapping[str, Callable[[Sequence[bytes]], Lines]] = {
     one.__name__: one
     for one in (
@@ -176,6 +184,7 @@ EXTRACTIONS: Mapping[str, Callable[[Sequence[bytes]], Lines]] = {
         pzt19,
         ferro_forc,
         tendon,
+        mirror,
     )
 }
 

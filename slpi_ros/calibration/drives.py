@@ -85,9 +85,17 @@ def checking(settings: CalibrationSettings) -> Drive:
 
 
 def compensated(
-    settings: CalibrationSettings, model: StageModel, seed: int, before: Sequence[Record] = ()
+    settings: CalibrationSettings,
+    model: StageModel,
+    seed: int,
+    before: Sequence[Record] = (),
+    *,
+    in_advance: bool = True,
 ) -> tuple[Drive, dict[str, FloatArray]]:
-    """Return a drive along a random path through the compensator, after a sweep that makes the memory known."""
+    """Return a drive along a random path through the compensator, after a sweep that makes the memory known.
+
+    With `in_advance` a delay is undone, as on a trajectory.
+    """
     # Also the desired displacement (m) of each axis, shape (N,): NaN in the sweep before and the return after the path.
     sweep = exciting(settings, SWEEP, _sweep_seconds(settings), settings.axes, seed)
     swept = np.column_stack(list(sweep.voltage.values()))
@@ -115,7 +123,11 @@ def compensated(
     longest = max(path.size for path in paths)
     paths = [np.pad(path, (0, longest - path.size), mode="edge") for path in paths]
     rows = np.empty((longest, len(paths)))
-    for index, desired in enumerate(np.column_stack(paths).tolist()):
+    asked = paths
+    if in_advance:
+        times = np.arange(longest, dtype=np.float64) * dt
+        asked = [model.axis(name).in_advance(times, path) for name, path in zip(settings.axes, paths, strict=True)]
+    for index, desired in enumerate(np.column_stack(asked).tolist()):
         stamp = FIRST_STAMP + round((index + 1) * dt * SECOND_NS)
         controller.update(stamp, settings.axes, desired, stamp)
         rows[index] = controller.voltages
@@ -124,7 +136,7 @@ def compensated(
     gap = np.full(len(swept), np.nan), np.full(len(back), np.nan)
     wanted = {axis: np.concatenate([gap[0], y, gap[1]]) for axis, y in zip(settings.axes, paths, strict=True)}
     path = "The desired path" if settings.path else "A path that no record holds"
-    why = f"{path}, through the compensator: what the model is worth."
+    why = f"{path}, through the compensator: the error of the model."
     drive = _drive(settings, voltage, why, limited=False)
     return drive, {axis: np.pad(y, (0, drive.t.size - y.size), constant_values=np.nan) for axis, y in wanted.items()}
 

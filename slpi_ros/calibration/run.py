@@ -335,7 +335,7 @@ class _Calibration:
         if shown:
             model = with_present_zero(model, self._records)
             path = replace(settings, path=showing(settings, model))
-            drive, desired = compensated(path, model, len(self._steps), self._records)
+            drive, desired = compensated(path, model, len(self._steps), self._records, in_advance=False)
             recording = self._recorded(LOOP_DRIVE, drive, desired, loops_of(found, model))
             for name, one in shown.items():
                 error = tracking_error(recording, name, model, settings.goal(self._repeatability[name]))
@@ -507,9 +507,12 @@ def why(verified: Sequence[Mapping[str, TrackingError]], diagnosis: Diagnosis, e
             "drifts"
         )
     effects: Sequence[Effect] = [each.effect for each in diagnosis.axes[name].effects]
-    lasting = [effect.name for effect in effects if effect.needs_feedback]
+    lasting = [effect.name for effect in effects if effect.needs_feedback and not effect.shift]
     if lasting:
-        said.append(f"{', '.join(lasting)} cannot be undone without feedback and will go on")
+        said.append(f"{', '.join(lasting)} cannot be compensated without feedback")
+    if late := sum(effect.shift for effect in effects):
+        # On the path of the verification it is undone.
+        said.append(f"the delay of {late * 1e3:.3g} ms is undone on a trajectory, and not by setpoints one by one")
     if abs(worst.offset) > worst.rest:
         creeps = any(effect.resembles_when_old for effect in effects)
         said.append(

@@ -54,7 +54,8 @@ class Uncertainty:
         model, memory, _ = of
         *turns, present = voltage_history(stream)
         here = Start(present, stream.memory.displacement, tuple(turns))
-        streaming = AxisUncertainty(replace(model, end=here), "end", memory in (KNOWN, RESTORED)).stream(age)
+        known = memory in (KNOWN, RESTORED)
+        streaming = AxisUncertainty(replace(model, end=here), "end", known, model.felt_range).stream(age)
         streaming.surround(surroundings)
         self._t = self._waited = 0.0
         streaming.note(0.0, stream.uncoupled_displacement + stream.coupled, stream.voltage)

@@ -277,8 +277,8 @@ def _evidence(effect: Effect, named: Named, chance: float, in_the_end: Score) ->
     )
     on = "other records" if named.after.records.size and not named.own else "other parts of the record"
     gained = (
-        f"{effect.describe()}; held-out error, on {on}: {before} before, {after} rms with it; all effects found "
-        f"{end}, the same without this one {without} (p = {chance:.2g} that chance gains as much)"
+        f"{effect.describe()}; held-out error on {on}: {before} rms before, {after} with it; with all effects found "
+        f"{end}, with all but this one {without} (p = {chance:.2g})"
     )
     if not named.runner_up:
         return f"{gained}; no other effect lowers it as much"
@@ -340,7 +340,7 @@ def _of_given(given: Given, selection: Selection, before_rms: float) -> str:
 
 def _in_model(now: Explanation, effects: Sequence[NamedEffect], dropped: Sequence[str]) -> str:
     own = [effect.name for effect in now.effects if isinstance(effect, EachRecord)]
-    said = f" Each record has its own, so not in the extended model: {', '.join(own)}." if own else ""
+    said = f" Not in the extended model, as it differs from record to record: {', '.join(own)}." if own else ""
     if undecided := [named.name for named in effects if named.alternatives and named.name not in own]:
         said += (
             f" In the extended model as one of several possible causes: {', '.join(undecided)}; proved at the drive "

@@ -284,18 +284,25 @@ def starts_at_end(axis: AxisModel, v: float) -> list[Start]:
     return [replace(axis.after(np.clip(ends, *axis.hysteresis_range)), from_rest=False), *rest]
 
 
+def ways_to(low: float, high: float, v: float) -> list[tuple[float, ...]]:
+    """Return the voltages (V) before `v` (V) that lead to the possible states there, in a range from `low` to `high`.
+
+    The first two come from an end of the range, from above and from below, others have turned once more; the last is a
+    decaying oscillation.
+    """
+    ways: list[tuple[float, ...]] = [(low, high), (high, low)]
+    ways += [(low, high, v + share * (low - v)) for share in LAST_MOVES[1:-1]]
+    ways += [(high, low, v + share * (high - v)) for share in LAST_MOVES[1:-1]]
+    shrink = 1.0 - np.arange(MIDDLE_LOOPS) / MIDDLE_LOOPS
+    decay = np.column_stack([v + (high - v) * shrink, v + (low - v) * shrink]).ravel()
+    return [*ways, (low, *decay.tolist())]
+
+
 def _possible_starts(axis: AxisModel, v: float) -> list[Start]:
     """Return possible hysteresis states at the voltage `v` (V), including the two extreme states."""
     if not axis.causal:
         return [axis.start, axis.start]
-    low, high = axis.hysteresis_range
-    ways = [[low, high, v], [high, low, v]]
-    ways += [[low, high, v + share * (low - v), v] for share in LAST_MOVES[1:-1]]
-    ways += [[high, low, v + share * (high - v), v] for share in LAST_MOVES[1:-1]]
-    shrink = 1.0 - np.arange(MIDDLE_LOOPS + 1) / MIDDLE_LOOPS
-    decay = np.column_stack([v + (high - v) * shrink, v + (low - v) * shrink]).ravel()
-    ways.append([low, *decay.tolist()])
-    starts = [axis.after(np.array(way)) for way in ways]
+    starts = [axis.after(np.array([*way, v])) for way in ways_to(*axis.hysteresis_range, v)]
     # Within the visited range, a stage at rest behaves like one whose hysteresis state was reset.
     after_reset = [replace(start, from_rest=False) for start in starts]
     return [*after_reset, axis.after(np.array([v])), axis.after(np.array([v]), "end")]

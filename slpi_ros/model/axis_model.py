@@ -320,6 +320,13 @@ class AxisModel:
         self.require_reachable(y)
         return self.command(t, y, limits, start_memory)
 
+    def in_advance(self, t: FloatArray, y: FloatArray) -> FloatArray:
+        """Return the setpoints, shape (N,), m, at times `t` (s) with which the stage is at `y`, shape (N,), m, in time.
+
+        Setpoints one by one come too late for the inverse to undo a delay, so that they are asked for early.
+        """
+        return np.interp(t + self.chain.delay, t, y)
+
     def require_reachable(self, y: FloatArray) -> None:
         """Raise an error, as `compensate`, unless `y`, (N,), metres, is finite and in the identified range."""
         require_finite(y)
@@ -425,6 +432,12 @@ class AxisModel:
         """Voltage range (V) of the hysteresis in the record: `voltage_range` within the limits of a saturation."""
         (low, high), (lowest, highest) = self.voltage_range, self.chain.clipped
         return max(low, lowest), min(high, highest)
+
+    @cached_property
+    def felt_range(self) -> tuple[float, float]:
+        """Voltage range (V) that the hysteresis has felt: an effect around it may have kept it from the limits."""
+        (low, high), turns = self.hysteresis_range, self.end.history if self.end and self.chain.around else ()
+        return max(low, min(turns, default=low)), min(high, max(turns, default=high))
 
     def _allowed(self, limits: Limits | None) -> Limits:
         return (limits or Limits(-inf, inf)).within(self.voltage_range)

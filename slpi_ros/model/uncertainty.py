@@ -5,8 +5,7 @@ docs/explanation/uncertainty.md says what each component assumes, and what is no
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
-from functools import cached_property
+from dataclasses import dataclass, fields
 from math import exp, hypot, inf, log1p, sqrt
 from numbers import Real
 from typing import TypeVar
@@ -16,7 +15,8 @@ import numpy as np
 from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import FollowedGain
 from slpi_ros.errors import ModelError, UsageError
-from slpi_ros.model.axis_model import ABOVE_NOISE, RESOLUTION, AxisModel, Start, StartMemory
+from slpi_ros.model.axis_model import ABOVE_NOISE, RESOLUTION, AxisModel, StartMemory
+from slpi_ros.model.unknown_memory import UnknownMemory
 
 # Equal parts of the displacement range for which a model document holds the error.
 REGIONS = 10
@@ -28,8 +28,8 @@ RECTANGULAR = 1.0 / sqrt(12.0)
 # rectangular distribution is this multiple of its rms.
 SYSTEMATIC = sqrt(3.0)
 Scalars = TypeVar("Scalars", float, FloatArray)
-# Points of the table over the range, and steps of that of the memory to either end.
-POINTS, STEPS = 200, 32
+# Points of the table over the range.
+POINTS = 200
 # Components of the budget, with what each of them is.
 COMPONENTS = {
     "fit": "covariance of the fit to the records",
@@ -73,9 +73,17 @@ class AxisUncertainty:
         Assumed initial state, as for `StageModel.compensate`.
     known_memory : bool, optional
         Whether this state is known. By default only that after ``wiped``: otherwise the stage may have moved since.
+    felt : (float, float), volts, optional
+        Voltage range that the hysteresis may have felt before. By default that of the record.
     """
 
-    def __init__(self, axis: AxisModel, start_memory: StartMemory = "end", known_memory: bool | None = None) -> None:
+    def __init__(
+        self,
+        axis: AxisModel,
+        start_memory: StartMemory = "end",
+        known_memory: bool | None = None,
+        felt: tuple[float, float] | None = None,
+    ) -> None:
         quality = axis.quality
         if quality.regions is None or quality.drift is None or quality.duration is None or quality.fastest is None:
             raise ModelError(
@@ -87,7 +95,7 @@ class AxisUncertainty:
                 f"the uncertainty of kind '{axis.kind}' is not known, as it needs the complete path in advance; "
                 "identify kind 'slpi'"
             )
-        self._axis, self._start_memory = axis, start_memory
+        self._axis, self._start_memory, self._felt = axis, start_memory, felt or axis.felt_range
         self.known_memory = start_memory == "wiped" if known_memory is None else known_memory
         self.low, high = axis.displacement_range
         self.stroke = high - self.low
@@ -147,45 +155,6 @@ class AxisUncertainty:
             return max(quality.held_out_rms, quality.rms) > ABOVE_NOISE * quality.floor_rms
         return quality.verdict in ("unexplained", "partly_named")
 
-    @cached_property
-    def memory_table(self) -> FloatArray:
-        """Square of the uncertainty (m^2) from the memory, after the voltage has gone down and up by so many steps.
-
-        Shape (`STEPS` + 1,) twice; the steps lead from the initial voltage to the lower and to the upper end of the
-        range.
-        """
-        axis = self._axis
-        low, high = axis.hysteresis_range
-        v0 = self.initial_voltage
-        down, up = np.linspace(v0, low, STEPS + 1), np.linspace(v0, high, STEPS + 1)
-        table = np.empty((STEPS + 1, STEPS + 1))
-        for k in range(STEPS + 1):
-            path = np.concatenate([down[: k + 1], up, [low, high]])
-            ways = []
-            for turns in ([high, v0], [high, low, v0]):
-                memory = replace(axis, start=Start(low, 0.0, (low,))).memory("start")
-                memory.forward_array(np.array(turns))
-                ways.append(memory.forward_array(path))
-            own = axis.memory(self._start_memory).forward_array(path)
-            # Once the whole range has been passed, all memories agree.
-            one, other = ((way - way[-1] - (own - own[-1]))[k + 1 : -2] for way in ways)
-            # Rectangular between the two extreme memories, about the assumed one.
-            table[k] = (one**2 + one * other + other**2) / 3.0
-        return table
-
-    @cached_property
-    def initial_voltage(self) -> float:
-        """Voltage (V) of the initial state, within the range."""
-        low, high = self._axis.hysteresis_range
-        return min(max(self._axis.initial(self._start_memory).voltage, low), high)
-
-    @cached_property
-    def _memory_steps(self) -> tuple[float, float]:
-        """Steps of `memory_table` for each volt below and above the initial voltage."""
-        low, high = self._axis.hysteresis_range
-        v0 = self.initial_voltage
-        return (STEPS / (v0 - low) if v0 > low else 0.0), (STEPS / (high - v0) if v0 < high else 0.0)
-
     def budget(
         self,
         t: FloatArray,
@@ -221,11 +190,13 @@ class AxisUncertainty:
         faster = np.maximum(rate / self.fastest - 1.0, 0.0) if self.fastest > 0.0 else np.zeros_like(t)
         rates = np.minimum(self.within[place] * faster**2, self.most**2)
         values = {} if surroundings is None else surroundings
+        unknown = self.unknown_memory()
+        memory = unknown.along(t, v) if unknown else np.zeros_like(v)
         return Budget(
             fit=self.fit[place],
             left=self.left[place],
             uncovered=np.sqrt(self.unvisited[place] ** 2 + rates),
-            memory=np.sqrt(self._memory_square(v) + self._relaxing_square(since)),
+            memory=np.sqrt(memory + self._relaxing_square(since)),
             age=np.sqrt(self._age_square(since, y)),
             surroundings=np.sqrt(self._surroundings_square(values, y)),
         )
@@ -239,22 +210,9 @@ class AxisUncertainty:
         values = {key: np.array([value]) for key, value in (surroundings or {}).items()}
         return known.budget(np.zeros(1), np.array([y]), np.zeros(1), age, values)
 
-    def _memory_square(self, v: FloatArray) -> FloatArray:
-        if self.known_memory:
-            return np.zeros_like(v)
-        v0, (down, up) = self.initial_voltage, self._memory_steps
-        low, high = np.minimum.accumulate(np.minimum(v, v0)), np.maximum.accumulate(np.maximum(v, v0))
-        lower = np.minimum((v0 - low) * down, STEPS).astype(np.int64)
-        upper = np.minimum((high - v0) * up, STEPS).astype(np.int64)
-        return self.memory_table[lower, upper]
-
-    def memory_square(self, lowest: float, highest: float) -> float:
-        """Return the square of the uncertainty (m^2) from the memory after voltages with these extremes (V)."""
-        if self.known_memory:
-            return 0.0
-        v0, (down, up) = self.initial_voltage, self._memory_steps
-        lower, upper = min((v0 - lowest) * down, STEPS), min((highest - v0) * up, STEPS)
-        return float(self.memory_table[max(int(lower), 0), max(int(upper), 0)])
+    def unknown_memory(self) -> UnknownMemory | None:
+        """Return how the unknown memory is forgotten from the initial state on; None if the memory is known."""
+        return None if self.known_memory else UnknownMemory(self._axis, self._start_memory, self._felt)
 
     def _relaxing_square(self, since: FloatArray) -> FloatArray:
         """Return the square (m^2) of what still relaxes after the moves before the start, or those of the reset."""
@@ -296,19 +254,14 @@ class StreamingUncertainty:
         self._more = bool(of.gain_drift_square or of.creep or of.quantities)
         self._fastest = of.fastest if of.fastest > 0.0 else inf
         self._values: dict[str, float] = {}
-        self._known = of.known_memory
-        self._memory = 0.0
-        self._extremes = of.initial_voltage, of.initial_voltage
-        self._since = 0.0
+        self._unknown = of.unknown_memory()
+        self._memory, self._since = 0.0, inf
         # Time (s), displacement (m) and voltage (V) of the last two samples.
         self._before = self._last = (0.0, 0.0, 0.0)
-        # No voltage is within these, so that the first sample begins the range.
-        self._lowest, self._highest = inf, -inf
 
     def reset(self, t: float) -> None:
         """Note that the memory is known, and the age counts, from time `t` (s) on: after a reset."""
-        self._known, self._memory, self._age, self._since = True, 0.0, 0.0, t
-        self._lowest, self._highest = -inf, inf
+        self._unknown, self._memory, self._age, self._since = None, 0.0, 0.0, t
 
     def surround(self, values: Mapping[str, float]) -> None:
         """Note values of quantities that the stage follows, by name, in their units."""
@@ -316,8 +269,10 @@ class StreamingUncertainty:
 
     def note(self, t: float, y: float, v: float) -> None:
         """Follow a sample: time (s), displacement (m) and its voltage (V)."""
-        if not self._lowest <= v <= self._highest:
-            self._reach(t, v)
+        if self._since == inf:
+            self._last, self._since = (t, 0.0, v), t
+        if self._unknown:
+            self._memory = self._unknown.step(t, v)
         self._before, self._last = self._last, (t, y, v)
 
     def step(self, t: float, y: float, v: float) -> float:
@@ -338,14 +293,6 @@ class StreamingUncertainty:
         if self._more:
             square += self._others(since, y)
         return sqrt(square + self._memory + self._drift * (since + self._of.duration))
-
-    def _reach(self, t: float, v: float) -> None:
-        """Note a voltage (V) beyond those so far, at time `t` (s)."""
-        if self._lowest > self._highest:
-            self._last, self._since = (t, 0.0, v), t
-            self._lowest, self._highest = self._extremes
-        self._lowest, self._highest = min(v, self._lowest), max(v, self._highest)
-        self._memory = 0.0 if self._known else self._of.memory_square(self._lowest, self._highest)
 
     def _others(self, since: float, y: float) -> float:
         """Return the square (m^2) of what few stages have: drift of the sensitivity, creep, followed quantities."""

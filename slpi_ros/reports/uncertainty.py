@@ -8,6 +8,7 @@ from typing import Any
 from slpi_ros.errors import SlpiError, length
 from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.uncertainty import COMPONENTS, COVERAGE_FACTOR, AxisUncertainty, Budget
+from slpi_ros.model.unknown_memory import UnknownMemory
 
 # Times since the reset or calibration, seconds, and places in the displacement range, shares.
 TIMES = {"1 s": 1.0, "1 min": 60.0, "1 h": 3600.0}
@@ -56,8 +57,8 @@ def describe_uncertainty(axis: AxisModel, *, details: bool = True) -> list[str]:
 
 def unknown_memory(axis: AxisModel) -> float:
     """Return the standard uncertainty (m) from a memory that is not known, before anything moves."""
-    own = AxisUncertainty(axis)
-    return sqrt(own.memory_square(own.initial_voltage, own.initial_voltage))
+    unknown = UnknownMemory(axis, "end", axis.felt_range)
+    return sqrt(unknown.step(0.0, unknown.start))
 
 
 def uncertainty_document(axis: AxisModel, known: Mapping[str, float]) -> dict[str, Any]:

@@ -7,14 +7,15 @@ import numpy as np
 import pytest
 
 import slpi_ros
-from benchmarks.measured import bench, scores
-from benchmarks.measured.manifest import Span, Task
-from benchmarks.measured.methods import METHODS, Invertible, Series, operators, possible_histories
-from benchmarks.measured.methods.base import Prepared, Scale, delayed, invert_by_iteration
+from benchmarks.measured import bench, scores, twins
+from benchmarks.measured.manifest import Span, Task, read_manifest
+from benchmarks.measured.methods import METHODS, Invertible, Series, chosen_history, operators, possible_histories
+from benchmarks.measured.methods.base import Prepared, Scale, delayed, invert_by_iteration, remembered
 from benchmarks.measured.methods.gru import GruMethod, forward, gradient
 from benchmarks.measured.methods.linear import Creep, Plays, Preisach, RatePlays
 from benchmarks.measured.methods.nonlinear import BoucWen, EnvelopePlays
 from slpi_ros.errors import IdentificationError
+from slpi_ros.identification.free_run import ways_to
 
 NAMES = [method.name for method in METHODS]
 RADII = np.arange(30) / 30
@@ -62,7 +63,7 @@ def system(name):
         case "rate-dep. PI":
             return columns(RatePlays(0.02)) @ falling
         case "PI, creep":
-            return columns(Creep()) @ np.concatenate([falling[:25], np.full(18, 0.05)])
+            return columns(Creep()) @ np.concatenate([falling[:25], np.full(9, 0.05)])
         case "Bouc-Wen":
             return columns(BoucWen((0.7, 0.3, 0.2))) @ np.array([2.0, 0.3, 0.1, -1.0])
         case "NARX":
@@ -87,14 +88,15 @@ def test_own_class(name):
     fitted = np.arange(COUNT) < JUDGED
     record = Series("record", t, v, np.where(fitted, y, np.nan), fitted)
     model = method.fit([record])
-    runs = [model.simulate("record", t, v, history) for history in possible_histories([record])]
+    histories = possible_histories([record], v[0])
+    runs = [model.simulate("record", t, v, history) for history in histories]
     errors = [100.0 * np.std((run - y)[JUDGED:]) / np.ptp(y) for run in runs]
     assert min(errors) < LARGEST.get(name, 0.15)
     # Networks and polynomials of past outputs have no inverse.
     assert isinstance(model, Invertible) == (name not in ("NARX", "GRU"))
     if isinstance(model, Invertible):
         clean = 10.0 * system(name) + 3.0
-        found = [model.invert("record", t, clean, history) for history in possible_histories([record])]
+        found = [model.invert("record", t, clean, history) for history in histories]
         assert min(np.std((own - v)[JUDGED:]) for own in found) < (0.02 if name in LARGEST else 0.01) * np.ptp(v)
 
 
@@ -113,12 +115,17 @@ def test_the_history_is_chosen_on_what_is_not_judged():
     t, v, _ = drive()
     fitted = np.arange(COUNT) < JUDGED
     record = Series("a", t, v, v, fitted)
-    chooses, judged = scores._split(replace(record, fitted=~fitted), [record])
+    chooses, judged = scores.split(replace(record, fitted=~fitted), [record])
     assert np.array_equal(chooses, fitted)
     assert np.array_equal(judged, ~fitted)
-    chooses, judged = scores._split(replace(record, name="b"), [record])
-    assert np.flatnonzero(chooses).tolist() == list(range(JUDGED // 10))
-    assert np.flatnonzero(judged).tolist() == list(range(JUDGED // 10, JUDGED))
+    # A hold of half of the record says nothing of the history.
+    held = replace(record, name="b", v=np.where(np.arange(COUNT) < JUDGED // 2, v[JUDGED // 2], v))
+    chooses, judged = scores.split(held, [record])
+    way = [np.sum(np.abs(np.diff(held.v[:JUDGED][part[:JUDGED]]))) for part in (chooses, judged)]
+    assert chooses[: JUDGED // 2].all()
+    assert way[0] / sum(way) == pytest.approx(0.1, abs=0.01)
+    assert np.array_equal(chooses | judged, fitted)
+    assert not (chooses & judged).any()
 
 
 def test_without_a_diagnosis_slpi_stays_as_it_is(monkeypatch):
@@ -197,3 +204,52 @@ def test_what_is_judged_is_not_given(tmp_path):
     (one,) = scores.fitted_series(scores.Tables(tmp_path), task)
     assert np.isnan(one.y[one.t >= 2.0]).all()
     assert np.isfinite(one.y[one.t < 2.0]).all()
+
+
+def test_a_record_at_an_end_comes_from_the_other_one():
+    t, v, _ = drive()
+    records = [Series("a", t, v, v, np.ones(COUNT, dtype=bool))]
+    low, high = float(v.min()), float(v.max())
+
+    def chosen(at, best, ratio, *, rested=False):
+        errors = [1.0 if history == best else ratio for history in possible_histories(records, at)]
+        return chosen_history(records, at, errors, rested=rested)
+
+    middle = (low + high) / 2.0
+    assert chosen(low, (), 1.05) == (high, low)
+    assert chosen(high, (), 1.05) == (low, high)
+    assert chosen(low, (), 1.05, rested=True) == ()
+    assert chosen(low, (), 1.2) == ()
+    assert chosen(middle, (), 1.05) == ()
+    # The ways to a state are those of the package.
+    assert possible_histories(records, middle)[:-2] == ways_to(low, high, middle)
+
+
+def test_what_is_remembered():
+    v = np.array([0.0, 5.0, -5.0, 3.0, 1.0, 2.0, -1.0, 2.5, 0.0, 1.0])
+    assert remembered(v) == (5.0, -5.0, 3.0, -1.0, 2.5, 0.0, 1.0)
+    assert remembered(-v) == tuple(-x for x in remembered(v))
+
+
+@pytest.mark.parametrize("name", [name for name in NAMES if "causes" not in name])
+def test_no_method_loses_to_a_line_on_its_own_data(measured_data, name):
+    task = next(task for task in read_manifest().tasks if task.name == "afm_double_sine")
+    tables = scores.Tables(measured_data)
+    line, own = (
+        next(iter(scores.score(tables, task, method).values()))
+        for method in (METHODS[0], GruMethod(steps=300) if name == "GRU" else METHODS[NAMES.index(name)])
+    )
+    assert own.fitted <= line.fitted * 1.001
+
+
+@pytest.mark.parametrize("name", ["PI, lag", "modified PI", "generalised PI", "Bouc-Wen", "Preisach", "NARX"])
+def test_a_method_and_its_twin(measured_data, name):
+    task = next(task for task in read_manifest().tasks if task.name == "afm_double_sine")
+    (found,) = twins.twin(measured_data, task, METHODS[NAMES.index(name)])
+    assert found[2] == pytest.approx(found[3], rel=twins.AGREES)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["line", "PI", "rate-dep. PI", "PI, creep", "GRU", "SLPI", "SLPI, causes"])
+def test_another_method_and_its_twin(measured_data, name):
+    test_a_method_and_its_twin(measured_data, name)

@@ -8,6 +8,7 @@ from calibration.stages import SimulatedRecorder, settings, stage_of
 
 from slpi_ros.calibration.drives import checking, compensated, exciting
 from slpi_ros.calibration.run import Request
+from slpi_ros.effects.delay import Delay
 from slpi_ros.errors import UnreachableError, UsageError
 from slpi_ros.excitation.drives import DRIVES
 from slpi_ros.identification.fit import identify
@@ -95,3 +96,19 @@ def test_a_given_path_is_driven_as_it_is(limits):
 def test_settings_that_allow_no_calibration_are_refused(wrong):
     with pytest.raises(UsageError):
         settings(**wrong)
+
+
+def test_the_verification_undoes_a_delay():
+    chosen = settings("x", rest=(10.0,))
+    recorder = SimulatedRecorder(stage_of(Character(delay=0.01), noise_rms=1e-9))
+    calibration = exciting(chosen, "calibration", 40.0, chosen.axes, 1)
+    model = identify(recorder(Request("calibration", calibration, {})).record)
+    late = replace(model, axes={"x": replace(model.axis("x"), effects=(Delay(0.01),))})
+    drive, desired = compensated(chosen, late, 7)
+    require_within(drive, chosen)
+    slope = np.gradient(desired["x"], drive.t)
+    for sent, least, most in [(drive, -1e-3, 1e-3), (compensated(chosen, late, 7, in_advance=False)[0], 9e-3, 11e-3)]:
+        reached = late.simulate(drive.t, sent.voltage)["x"]
+        known, error = slope[np.isfinite(slope)], (desired["x"] - reached)[np.isfinite(slope)]
+        error -= error.mean()
+        assert least < float(known @ error / (known @ known)) < most

@@ -11,6 +11,8 @@ from strategies import FAMILY_CASE, axis_model
 
 from slpi_ros.calibration.run import Recording, aligned, calibrate, tracking_error, why, with_present_zero
 from slpi_ros.effects.creep import Creep
+from slpi_ros.effects.delay import Delay
+from slpi_ros.effects.thermal_drift import ThermalDrift
 from slpi_ros.errors import IdentificationError, RecordError, SlpiError, length
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import StageModel
@@ -155,6 +157,16 @@ def test_errors_are_absolute_and_the_latest_verification_counts():
     risen = f"{length(first.mean)} to {length(moved.mean)}"
     assert said.startswith("target not met") and risen in said and "~/set_zero" in said
     assert why([{"x": moved}, {"x": first}], diagnosis, "").startswith("target met")
+
+
+def test_a_delay_is_told_as_undone_on_a_trajectory_alone():
+    for effect, told in [
+        (Delay(4.8e-3), ["4.8 ms", "trajectory"]),
+        (ThermalDrift((0.0, 1.0), (0.0, 0.0)), ["feedback"]),
+    ]:
+        axis = SimpleNamespace(effects=(SimpleNamespace(effect=effect),))
+        said = why([{"x": error_of(np.full(100, 1e-9))}], SimpleNamespace(axes={"x": axis}), "")
+        assert all(each in said for each in told) and ("feedback" in said) == (told == ["feedback"])
 
 
 def test_lengths_are_told_in_their_own_unit():

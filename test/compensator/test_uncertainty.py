@@ -50,7 +50,7 @@ def test_it_is_that_of_the_model_while_somebody_asks(effects):
     own, (one,) = AxisUncertainty(axis), controller.axes
     # Ten minutes after the calibration, besides the record; the memory has not been known since.
     assert told[0] ** 2 > own.within[0] + QUALITY.drift**2 * 630.0
-    assert told[0] ** 2 < own.within[0] + QUALITY.drift**2 * 640.0 + own.memory_table.max() + (1e-7) ** 2
+    assert told[0] ** 2 < own.within[0] + QUALITY.drift**2 * 640.0 + (own.most / 2.0) ** 2
     assert one.expected == pytest.approx(y[-1], abs=1e-12)
     assert watch(controller, False, NOW, round(t[-1] * SECOND)) == ""
     assert one.uncertainty.present is None

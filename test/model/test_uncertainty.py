@@ -11,6 +11,7 @@ from model.test_surroundings import LOAD, WARM
 from strategies import FAMILY_CASE, axis_model, two_axes
 
 import slpi_ros
+from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.effects.rate_dependence import RateDependence
@@ -135,6 +136,35 @@ def test_the_memory_is_known_after_a_reset_and_after_the_whole_range():
     assert stream.step(1.0, 5e-6, 40.0) == pytest.approx(
         AxisUncertainty(axis, "wiped").budget(np.zeros(1), CONSTANT[:1], v[:1]).combined[0]
     )
+
+
+@pytest.mark.parametrize("name", ["memory", "law", "creep"])
+def test_what_the_path_has_not_passed_alone_is_remembered(name):
+    axis = replace(AXES[name], end=AXES["memory"].end)
+    v = np.concatenate([np.linspace(a, b, 500) for a, b in [(40.0, 99.9), (99.9, 0.1), (0.1, 60.0)]])
+    t = np.arange(v.size) * 0.1
+    memory = AxisUncertainty(axis).budget(t, np.full(v.size, 5e-6), v).memory
+    relaxed = AxisUncertainty(axis, known_memory=True).budget(t, np.full(v.size, 5e-6), v).memory
+    assert memory[0] > 0.1e-6 and (memory >= relaxed).all()
+    assert memory[600] < 0.03 * memory[0] + relaxed[600] and memory[-1] < 1e-9 + relaxed[-1] < 3e-9
+
+
+def test_a_voltage_that_the_hysteresis_does_not_feel_has_passed_nothing():
+    axis = replace(AXES["law"], effects=(RateDependence(4.0, 0.1),), end=AXES["memory"].end)
+    v = np.array([40.0, 100.0, 0.0, 50.0])
+    quick, slow = (AxisUncertainty(axis).budget(np.arange(4) * dt, np.full(4, 5e-6), v).memory for dt in (1e-2, 1e5))
+    assert slow[-1] < 1e-12 and quick[-1] > 20e-9
+
+
+def test_after_the_range_that_the_records_have_felt_nothing_is_unknown():
+    """A rate law keeps the hysteresis from the limits, in the record and in use."""
+    law = replace(AXES["law"], effects=(RateDependence(4.0, 0.1),))
+    loops = 50.0 - 50.0 * np.cos(np.arange(400) * 0.05 * np.pi)
+    u = law.effects[0].apply(loops, EffectContext.since_start(np.arange(400) * 1e-2))
+    axis = replace(law, end=law.after(np.append(u, 40.0)))
+    v = np.concatenate([[40.0], loops[10:]])
+    memory = AxisUncertainty(axis).budget(np.arange(v.size) * 1e-2, np.full(v.size, 5e-6), v).memory
+    assert memory[0] > 0.1e-6 and memory[-1] < 0.01 * memory[0]
 
 
 def test_the_age_grows_as_a_random_walk_and_creep_as_its_logarithm():

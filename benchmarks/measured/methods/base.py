@@ -1,11 +1,13 @@
 """What every method is given and gives back, and what several of them share: scaling, histories, lag and delay."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
+
+from slpi_ros.identification.free_run import AS_WELL, AT_END, MIDDLE_LOOPS, ways_to
 
 FloatArray = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -34,6 +36,8 @@ class Series:
     y : ndarray, shape (N,), in the unit of the table; NaN where nothing was read
     fitted : ndarray of bool, shape (N,)
         The samples that may be fitted. Earlier voltages may be used, other displacements not.
+    history : tuple of float, V
+        Of a fitted record: the voltages before it that are likely, see `chosen_history`.
     """
 
     name: str
@@ -41,6 +45,7 @@ class Series:
     v: FloatArray
     y: FloatArray
     fitted: Mask
+    history: tuple[float, ...] = ()
 
 
 class Fitted(Protocol):
@@ -77,11 +82,45 @@ class Method(Protocol):
         ...
 
 
-def possible_histories(records: Sequence[Series]) -> tuple[tuple[float, ...], ...]:
-    """Return the histories before a record that are tried: never moved, or from either end of the fitted range."""
-    low = min(float(np.nanmin(one.v)) for one in records)
-    high = max(float(np.nanmax(one.v)) for one in records)
-    return ((), (high, low), (low, high))
+def voltage_range(records: Sequence[Series]) -> tuple[float, float]:
+    """Return the lowest and the highest voltage, V."""
+    return min(float(np.nanmin(one.v)) for one in records), max(float(np.nanmax(one.v)) for one in records)
+
+
+def possible_histories(records: Sequence[Series], v: float) -> list[tuple[float, ...]]:
+    """Return the histories before a record that begins at `v` (V) that are tried: those of ``slpi verify``.
+
+    They come from the ends of the fitted range; never moved; and continued where the last fitted record ends.
+    """
+    return [*ways_to(*voltage_range(records), v), (), remembered(records[-1].v)]
+
+
+def remembered(v: FloatArray) -> tuple[float, ...]:
+    """Return the reversals that are remembered after voltages `v` (N,), oldest first, V; of many the largest."""
+    v = v[np.isfinite(v)]
+    turns: list[float] = []
+    at, side = 0, 1.0 if np.argmax(v) <= np.argmin(v) else -1.0
+    while at < v.size - 1 and len(turns) < 2 * MIDDLE_LOOPS:
+        at = v.size - 1 - int(np.argmax(side * v[at:][::-1]))
+        turns.append(float(v[at]))
+        side = -side
+    return tuple(turns)
+
+
+def chosen_history(
+    records: Sequence[Series], v: float, errors: Sequence[float], *, rested: bool = False
+) -> tuple[float, ...]:
+    """Return one of the possible histories of a record that begins at `v` (V), V.
+
+    As in ``slpi verify`` a record that begins at an end of the fitted range comes from the other end (or had never
+    moved, if the model `rested` there), unless another history has one of `errors`, (H,), that is smaller by a tenth;
+    any other record has the history with the least error.
+    """
+    histories, (low, high) = possible_histories(records, v), voltage_range(records)
+    near, best = AT_END * (high - low), int(np.argmin(errors))
+    swept = 0 if v >= high - near else 1 if v <= low + near else best
+    at_end = min([swept, histories.index(())] if rested else [swept], key=lambda one: errors[one])
+    return histories[at_end if swept != best and errors[at_end] <= AS_WELL * errors[best] else best]
 
 
 @dataclass(frozen=True)
@@ -249,10 +288,3 @@ def _finest(cost: Callable[[float], float], values: Sequence[float]) -> tuple[fl
         found |= {(best + other) / 2.0: cost((best + other) / 2.0) for other in beside if other != best}
     best = min(found, key=lambda x: found[x])
     return best, found[best]
-
-
-def each_history(records: Sequence[Series], scale: Scale) -> Iterator[tuple[int, tuple[float, ...]]]:
-    """Yield each record's number with each possible history, scaled."""
-    for number in range(len(records)):
-        for history in possible_histories(records):
-            yield number, tuple(float(x) for x in scale.voltage(np.asarray(history)))

@@ -14,7 +14,6 @@ from numba import njit
 from numpy.typing import NDArray
 
 from benchmarks.measured.methods.base import FloatArray, Scale, Series
-from benchmarks.measured.methods.linear import likely_histories
 from benchmarks.measured.methods.narx import Run, resampled
 
 IntArray = NDArray[np.int64]
@@ -145,8 +144,8 @@ class GruModel:
 
     def simulate(self, name: str, t: FloatArray, v: FloatArray, history: tuple[float, ...]) -> FloatArray:
         """Return the displacement, shape (N,)."""
-        one = Series(name, t, v, np.zeros(t.size), np.ones(t.size, dtype=np.bool_))
-        run = resampled(one, self.scale, self.step, history)
+        one = Series(name, t, v, np.zeros(t.size), np.ones(t.size, dtype=np.bool_), history)
+        run = resampled(one, self.scale, self.step)
         w, r, out = self.weights
         y, _ = forward(_inputs(run.u, self.speed), w, r, out, np.zeros(HIDDEN))
         grid = run.start + self.step * np.arange(y.size)
@@ -172,8 +171,7 @@ class GruMethod:
         total = sum(float(one.t[-1] - one.t[0]) for one in records)
         shortest = min(float(np.median(np.diff(one.t))) for one in records)
         step = max(total / SAMPLES, shortest)
-        histories = likely_histories(records)
-        runs = [resampled(one, scale, step, history) for one, history in zip(records, histories, strict=True)]
+        runs = [resampled(one, scale, step) for one in records]
         constants = _constants(runs, scale)
         speed = float(np.sqrt(np.mean(np.concatenate([np.diff(run.u) for run in runs]) ** 2))) + 1e-12
         xs = [_inputs(run.u, speed) for run in runs]

@@ -20,6 +20,7 @@ from benchmarks.measured.methods.base import (
     Prepared,
     Scale,
     Series,
+    chosen_history,
     delayed,
     invert_by_iteration,
     possible_histories,
@@ -31,7 +32,8 @@ from benchmarks.measured.methods.base import (
 IntArray = NDArray[np.int64]
 
 # Ridge on the weights, as a share of the mean square of their columns: settles weights that no sample tells apart. The
-# first is that of the searches; that of the fit is the best of all on blocks left out.
+# first is that of the searches; that of the fit predicts blocks left out best, or, for play operators, is the largest
+# within one standard error of it (Breiman et al. 1984): the weights of loops wider than the fitted ones rest on it.
 RIDGES, BLOCKS = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2), 5
 
 
@@ -92,14 +94,19 @@ class Creep:
     free: int = 0
     creeping: tuple[float, ...] = (0.0, 0.15, 0.4)
     decades: int = 6
+    times: tuple[float, ...] = (0.1, 1.0, 10.0)  # s
+
+    def over(self, prepared: Sequence[Prepared]) -> "Creep":
+        """Return the method with time constants from a few samples to half of the longest record."""
+        period = min(one.period for one in prepared)
+        longest = max(float(one.t[-1] - one.t[one.skipped]) for one in prepared)
+        times = np.geomspace(3.0 * period, max(longest / 2.0, 10.0 * period), self.decades)
+        return replace(self, times=tuple(times.tolist()))
 
     def columns(self, prepared: Prepared, u: FloatArray, rows: IntArray) -> FloatArray:
-        """Return play operators, and the lags of some of them with time constants over the record's decades."""
+        """Return play operators, and the lags of some of them."""
         own = operators.plays(u, np.arange(self.count) / self.count, rows)
-        t = prepared.t
-        longest = float(t[-1] - t[prepared.skipped])
-        constants = np.geomspace(3.0 * prepared.period, max(longest / 2.0, 10.0 * prepared.period), self.decades)
-        shares = -np.expm1(-np.diff(t, prepend=t[0])[:, None] / constants)
+        shares = -np.expm1(-np.diff(prepared.t, prepend=prepared.t[0])[:, None] / np.array(self.times))
         every = np.arange(u.size)
         slow = [
             operators.relaxations(operators.plays(u, np.array([radius]), every)[:, 0], shares, rows)
@@ -206,11 +213,11 @@ def solve(
 
 
 def solve_with_ridge(
-    columns: FloatArray, y: FloatArray, record: IntArray, free: int
+    columns: FloatArray, y: FloatArray, record: IntArray, free: int, *, largest: bool = False
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Return what `solve` does with the ridge that predicts blocks left out best."""
-    errors = np.zeros(len(RIDGES))
-    for left_out in np.array_split(np.arange(y.size), BLOCKS):
+    """Return what `solve` does with the ridge that predicts blocks left out best, or the `largest` as good."""
+    errors = np.zeros((len(RIDGES), BLOCKS))
+    for block, left_out in enumerate(np.array_split(np.arange(y.size), BLOCKS)):
         kept = np.ones(y.size, dtype=np.bool_)
         kept[left_out] = False
         # A block may hold a whole record: numbers without gaps.
@@ -218,8 +225,13 @@ def solve_with_ridge(
         for k, share in enumerate(RIDGES):
             weights, _, _ = solve(columns[kept], y[kept], number, free, share)
             # Without its mean, as the errors of the table.
-            errors[k] += float(np.var(columns[left_out] @ weights - y[left_out])) * left_out.size
-    return solve(columns, y, record, free, RIDGES[int(np.argmin(errors))])
+            errors[k, block] = np.var(columns[left_out] @ weights - y[left_out])
+    mean = errors.mean(axis=1)
+    chosen = int(np.argmin(mean))
+    if largest:
+        limit = mean[chosen] + float(np.std(errors[chosen], ddof=1)) / np.sqrt(BLOCKS)
+        chosen = int(np.flatnonzero(mean <= limit)[-1])
+    return solve(columns, y, record, free, RIDGES[chosen])
 
 
 @dataclass(frozen=True)
@@ -234,13 +246,13 @@ class Problem:
     record: IntArray = field(repr=False)
 
     @classmethod
-    def of(cls, records: Sequence[Series], histories: Sequence[tuple[float, ...]], most: int) -> "Problem":
-        """Prepare records, each with the history given."""
+    def of(cls, records: Sequence[Series], most: int) -> "Problem":
+        """Prepare records, each with its history."""
         scale = Scale.of(records)
         rows = rows_of(records, most)
         prepared = tuple(
-            prepare(one.t, scale.voltage(one.v), [float(x) for x in scale.voltage(np.asarray(history, dtype=float))])
-            for one, history in zip(records, histories, strict=True)
+            prepare(one.t, scale.voltage(one.v), [float(x) for x in scale.voltage(np.asarray(one.history))])
+            for one in records
         )
         y = np.concatenate([scale.displacement(one.y[at]) for one, at in zip(records, rows, strict=True)])
         number = np.concatenate([np.full(at.size, k) for k, at in enumerate(rows)])
@@ -266,14 +278,14 @@ class Problem:
         return solve(self.columns(features, delay, lag), self.y, self.record, features.free)[2]
 
 
-def likely_histories(records: Sequence[Series]) -> list[tuple[float, ...]]:
-    """Return the history of each record with which a classical model fits best, V."""
-    possible = possible_histories(records)
-    features, chosen = Plays(count=15), []
-    for one in records:
-        costs = [Problem.of([one], [history], SEARCH_ROWS).cost(features, 0.0, 0.0) for history in possible]
-        chosen.append(possible[int(np.argmin(costs))])
-    return chosen
+def likely_history(records: Sequence[Series], one: Series) -> tuple[float, ...]:
+    """Return the history of one of the fitted records, V: chosen by the error with which a classical model fits it."""
+    v = float(one.v[np.isfinite(one.v)][0])
+    costs = [
+        Problem.of([replace(one, history=history)], SEARCH_ROWS).cost(Plays(count=15), 0.0, 0.0)
+        for history in possible_histories(records, v)
+    ]
+    return chosen_history(records, v, costs)
 
 
 @dataclass(frozen=True)
@@ -297,17 +309,20 @@ class LinearMethod:
 
     def fit(self, records: Sequence[Series]) -> LinearModel:
         """Search delay, lag and rate parameter, then solve for the weights."""
-        histories = likely_histories(records)
-        coarse = Problem.of(records, histories, SEARCH_ROWS)
+        coarse = Problem.of(records, SEARCH_ROWS)
         features, delay, lag = self.features, 0.0, 0.0
         tried = self.search or features
         if self.with_lag:
             delay, lag = search_lag(lambda d, x: coarse.cost(tried, d, x), coarse.period)
         if isinstance(features, RatePlays):
             features, delay, lag = _with_rate(features, coarse, delay, lag)
-        problem = Problem.of(records, histories, MOST_ROWS)
+        if isinstance(features, Creep):
+            features = features.over(coarse.prepared)
+        problem = Problem.of(records, MOST_ROWS)
         columns = problem.columns(features, delay, lag)
-        weights, constants, _ = solve_with_ridge(columns, problem.y, problem.record, features.free)
+        weights, constants, _ = solve_with_ridge(
+            columns, problem.y, problem.record, features.free, largest=isinstance(features, Plays | Creep | RatePlays)
+        )
         own = {one.name: float(c) for one, c in zip(records, constants, strict=True)}
         return LinearModel(features, problem.scale, weights, own, delay, lag)
 

@@ -14,12 +14,15 @@ from numpy.typing import NDArray
 
 from benchmarks.measured.methods import operators
 from benchmarks.measured.methods.base import SEARCH_ROWS, FloatArray, Scale, Series, prepare
-from benchmarks.measured.methods.linear import likely_histories
 
 IntArray = NDArray[np.int64]
 
 # Highest degree of a term, and most terms.
 DEGREE, MOST_TERMS = 3, 22
+# Blocks left out in turn: the polynomial is the one whose free run predicts them best.
+BLOCKS = 5
+# Its free run stays within this share of the range around the mean, also where the fitted voltages pass at these paces.
+WITHIN, PACES = 1.0, (0.5, 1.0, 2.0)
 # Samples of all records together at which the model is computed; several are tried.
 SAMPLES = (1500, 4000, 12000)
 # Numbers of terms that are tried.
@@ -100,63 +103,88 @@ class NarxModel:
 
 @dataclass(frozen=True)
 class NarxMethod:
-    """The method: the step of time and the number of terms with the least free-run error of the fitted samples."""
+    """The method: the step of time and the terms whose free run has the least error on blocks left out."""
 
     name: str = "NARX"
 
     def fit(self, records: Sequence[Series]) -> NarxModel:
         """Choose terms for each step of time, and keep the best free run."""
         scale, powers = Scale.of(records), candidates()
-        histories = likely_histories(records)
         total = sum(float(one.t[-1] - one.t[0]) for one in records)
         shortest = min(float(np.median(np.diff(one.t))) for one in records)
-        best: tuple[float, NarxModel] | None = None
+        best: tuple[bool, float, NarxModel] | None = None
         for samples in SAMPLES:
             step = max(total / samples, shortest)
-            runs = [resampled(one, scale, step, history) for one, history in zip(records, histories, strict=True)]
-            pairs = [_fitted_rows(run, powers) for run in runs]
-            x, y = np.vstack([a for a, _ in pairs]), np.concatenate([b for _, b in pairs])
+            runs = [resampled(one, scale, step) for one in records]
+            inside = [run.fitted[2:] & run.fitted[1:-1] & run.fitted[:-2] for run in runs]
+            x = np.vstack([regressors(run.y, run.u, powers)[own] for run, own in zip(runs, inside, strict=True)])
+            y = np.concatenate([run.y[2:][own] for run, own in zip(runs, inside, strict=True)])
             share = max(1, len(y) // (2 * SEARCH_ROWS))
-            order = chosen_terms(x[::share], y[::share], MOST_TERMS)
-            for size in SIZES:
-                terms = order[:size]
-                gains = np.linalg.lstsq(x[:, terms], y, rcond=None)[0]
-                found = _judged(runs, scale, step, powers[terms], gains)
-                if best is None or found[0] < best[0]:
+            # Without past outputs a free run cannot grow without bound.
+            usable = [np.arange(len(powers)), np.flatnonzero(powers[:, :2].sum(axis=1) == 0)]
+            orders = [own[chosen_terms(x[::share][:, own], y[::share], MOST_TERMS)] for own in usable]
+            for terms in (order[:size] for order in orders for size in SIZES):
+                model = _solved(runs, scale, step, powers[terms], x[:, terms], y)
+                found = _fails(runs, model), _left_out(runs, inside, model.powers, x[:, terms], y), model
+                if best is None or found[:2] < best[:2]:
                     best = found
             if step == shortest:
                 break
         assert best is not None
-        return best[1]
+        return best[2]
 
 
-def resampled(one: Series, scale: Scale, step: float, history: tuple[float, ...]) -> Run:
-    before = [float(x) for x in scale.voltage(np.asarray(history, dtype=np.float64))]
+def resampled(one: Series, scale: Scale, step: float) -> Run:
+    before = [float(x) for x in scale.voltage(np.asarray(one.history, dtype=np.float64))]
     prepared = prepare(one.t, scale.voltage(one.v), before)
-    grid = np.arange(prepared.t[0], prepared.t[-1], step)
+    # The last one is not before the end of the record.
+    grid = prepared.t[0] + step * np.arange(int(np.ceil((prepared.t[-1] - prepared.t[0]) / step)) + 1)
     known = np.isfinite(one.y)
     y = np.interp(grid, one.t[known], scale.displacement(one.y[known]))
-    fitted = np.interp(grid, one.t, one.fitted.astype(np.float64), left=0.0) > 0.999
+    fitted = np.interp(grid, one.t, one.fitted.astype(np.float64), left=0.0, right=0.0) > 0.999
     return Run(one.name, float(grid[0]), np.interp(grid, prepared.t, prepared.u), y, fitted)
 
 
-def _fitted_rows(run: Run, powers: IntArray) -> tuple[FloatArray, FloatArray]:
-    inside = run.fitted[2:] & run.fitted[1:-1] & run.fitted[:-2]
-    return regressors(run.y, run.u, powers)[inside], run.y[2:][inside]
+def _left_out(
+    runs: Sequence[Run], inside: Sequence[NDArray[np.bool_]], powers: IntArray, x: FloatArray, y: FloatArray
+) -> float:
+    """Return the mean square of the free-run errors of blocks left out, without their means."""
+    total = 0.0
+    for block in np.array_split(np.arange(y.size), BLOCKS):
+        gains = _gains(np.delete(x, block, axis=0), np.delete(y, block))
+        found = [operators.polynomial_run(run.u, powers, gains, 0.0)[2:] for run in runs]
+        errors = y - np.concatenate([one[own] for one, own in zip(found, inside, strict=True)])
+        total += float(np.var(errors[block])) * block.size
+    return total / y.size
 
 
-def _judged(
-    runs: Sequence[Run], scale: Scale, step: float, powers: IntArray, gains: FloatArray
-) -> tuple[float, NarxModel]:
-    """Return the free-run rms error of the fitted samples, and the model with the constant of each record."""
-    errors, constants = [], {}
+def _gains(x: FloatArray, y: FloatArray) -> FloatArray:
+    return np.asarray(np.linalg.lstsq(x, y, rcond=None)[0], dtype=np.float64)
+
+
+def _fails(runs: Sequence[Run], model: NarxModel) -> bool:
+    """Return whether a free run leaves the bounds at any pace, or explains the fitted samples worse than a line."""
+    own, line = 0.0, 0.0
     for run in runs:
-        error = run.y - operators.polynomial_run(run.u, powers, gains, 0.0)
-        kept = error[run.fitted]
-        constants[run.name] = float(np.mean(kept))
-        errors.append(kept - np.mean(kept))
-    rms = float(np.sqrt(np.mean(np.concatenate(errors) ** 2)))
-    return rms, NarxModel(scale, step, powers, gains, constants)
+        at = np.arange(run.u.size)
+        for pace in PACES:
+            u = np.interp(np.arange(0.0, at.size - 1.0, pace), at, run.u)
+            if np.max(np.abs(operators.polynomial_run(u, model.powers, model.gains, 0.0))) > WITHIN:
+                return True
+        error = run.y - operators.polynomial_run(run.u, model.powers, model.gains, 0.0)
+        u, y = run.u[run.fitted], run.y[run.fitted]
+        own += float(np.var(error[run.fitted])) * y.size
+        line += float(np.var(y - np.polyval(np.polyfit(u, y, 1), u))) * y.size
+    return own > line
+
+
+def _solved(
+    runs: Sequence[Run], scale: Scale, step: float, powers: IntArray, x: FloatArray, y: FloatArray
+) -> NarxModel:
+    """Return the model with the constant of each record."""
+    gains = _gains(x, y)
+    errors = {run.name: (run.y - operators.polynomial_run(run.u, powers, gains, 0.0))[run.fitted] for run in runs}
+    return NarxModel(scale, step, powers, gains, {name: float(np.mean(error)) for name, error in errors.items()})
 
 
 NARX = NarxMethod()

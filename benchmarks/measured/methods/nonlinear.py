@@ -21,7 +21,6 @@ from benchmarks.measured.methods.linear import (
     LinearModel,
     Plays,
     Problem,
-    likely_histories,
     solve,
     solve_with_ridge,
 )
@@ -79,8 +78,7 @@ class ShapedMethod:
 
     def fit(self, records: Sequence[Series]) -> LinearModel:
         """Search the shape without lag, then delay and lag, then both shape and lag together."""
-        histories = likely_histories(records)
-        coarse = Problem.of(records, histories, SEARCH_ROWS)
+        coarse = Problem.of(records, SEARCH_ROWS)
 
         def cost(shape: Sequence[float], delay: float, lag: float) -> float:
             if not np.all(np.abs(shape) < 20.0):
@@ -101,7 +99,7 @@ class ShapedMethod:
         _, shape, delay, lag = min(found)
         features = type(self.features)(shape)
         delay, lag = _refined_lag(coarse, features, delay, lag)
-        problem = Problem.of(records, histories, MOST_ROWS)
+        problem = Problem.of(records, MOST_ROWS)
         columns = problem.columns(features, delay, lag)
         weights, constants, _ = solve_with_ridge(columns, problem.y, problem.record, features.free)
         own_constants = {one.name: float(c) for one, c in zip(records, constants, strict=True)}
@@ -163,8 +161,7 @@ class ModifiedMethod:
 
     def fit(self, records: Sequence[Series]) -> ModifiedModel:
         """Search delay and lag with a classical model, then fit both parts together."""
-        histories = likely_histories(records)
-        coarse = Problem.of(records, histories, SEARCH_ROWS)
+        coarse = Problem.of(records, SEARCH_ROWS)
         features = Plays(count=self.plays)
         delay, lag = search_lag(lambda d, x: coarse.cost(features, d, x), coarse.period)
         columns = coarse.columns(features, delay, lag)

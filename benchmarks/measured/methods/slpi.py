@@ -10,7 +10,7 @@ from benchmarks.measured.methods.base import FloatArray, Series
 from benchmarks.records import settled
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.record import Record
-from slpi_ros.model.axis_model import AxisModel, Start
+from slpi_ros.model.axis_model import AxisModel
 
 AXIS = "x"
 # The package counts in metres, the tables in micrometres or in what stands for them.
@@ -25,6 +25,11 @@ class SlpiModel:
     fitted: frozenset[str]
     first: str
     said: str
+
+    @property
+    def rested(self) -> bool:
+        """Whether the first fitted record begins where the stage had never moved."""
+        return not self.model.start.history
 
     def simulate(self, name: str, t: FloatArray, v: FloatArray, history: tuple[float, ...]) -> FloatArray:
         """Return the displacement, shape (N,)."""
@@ -45,9 +50,8 @@ class SlpiModel:
         if name == self.first and not history:
             # The state that the identification found for this record.
             return model
-        path = np.array([model.start.voltage, *history, v])
-        level = replace(model, effects=()).after(path)
-        return replace(model, start=Start(v, level.displacement, history))
+        start = model.after(np.array([*history, v]))
+        return replace(model, start=replace(start, from_rest=False) if history else start)
 
 
 def _record(one: Series) -> Record:

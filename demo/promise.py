@@ -1,0 +1,39 @@
+"""The promise of the calibrator in the demo: the best run, and why promise and run differ."""
+
+from collections.abc import Sequence
+
+import numpy as np
+import plots
+
+# The error of the demo agrees with that of the calibration within this factor.
+FACTOR = 1.5
+
+
+def best_of(runs: Sequence[plots.Run]) -> int:
+    """Return the number of the run with the smallest mean error."""
+    return int(np.argmin([np.abs(run.error).mean() for run in runs]))
+
+
+def kept(promised: float, runs: Sequence[plots.Run]) -> str:
+    """Return a sentence about the promised mean error (m) and that of the demo; where they differ, about the reason."""
+    run = runs[-1]
+    mean = float(np.abs(run.error).mean())
+    said = f" The calibrator promised a mean error of {promised * 1e9:.1f} nm; here it is {mean * 1e9:.1f} nm"
+    best = runs[best_of(runs)]
+    if best is not run:
+        said += f", and {np.abs(best.error).mean() * 1e9:.1f} nm with {best.name}"
+    if promised / FACTOR <= mean <= promised * FACTOR and best is run:
+        return f"{said}."
+    # What may have changed since the calibration, by what it would leave of the error.
+    causes = {
+        "the zero, which is off by {:.1f} nm": (np.ones_like(run.t), 1e9),
+        "the time, by which the stage is {:.2f} ms late": (-np.gradient(run.desired, run.t), 1e3),
+        "the sensitivity, which is off by {:.3f} %": (run.desired - run.desired.mean(), 1e2),
+    }
+    left = {}
+    for name, (column, unit) in causes.items():
+        size = float(column @ run.error / (column @ column))
+        left[name.format(size * unit)] = float(np.abs(run.error - size * column).mean())
+    name = min(left, key=left.__getitem__)
+    late = f" {run.late:.1%} of the setpoints were sent late." * bool(run.late)
+    return f"{said}. Of zero, time and sensitivity it is {name}: without it {left[name] * 1e9:.1f} nm are left.{late}"

@@ -1,0 +1,51 @@
+"""The promise of the calibrator in the demo: the best row, and a reason where promise and run differ."""
+
+import re
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+DEMO = str(Path(__file__).resolve().parents[2] / "demo")
+RATE = 100.0
+T = np.arange(1000) / RATE
+Y = 5e-6 + 3e-6 * np.sin(2.0 * np.pi * T / 3.0)
+
+
+@pytest.fixture(scope="module")
+def demo():
+    """Return the modules under test, imported as scripts import them."""
+    sys.path.append(DEMO)
+    try:
+        import plots
+        import promise
+
+        yield {"plots": plots, "promise": promise}
+    finally:
+        sys.path.remove(DEMO)
+
+
+@pytest.fixture
+def run(demo):
+    noise = 10e-9 * np.random.default_rng(1).standard_normal(T.size)
+    return lambda name, error: demo["plots"].Run(name, T, Y, Y + noise + error)
+
+
+def test_the_best_row_is_that_with_the_smallest_error(demo, run):
+    runs = [run("uncompensated", 1e-6), run("SLPI", 0.0), run("SLPI with causes", 20e-9)]
+    assert demo["promise"].best_of(runs) == 1
+    assert demo["promise"].best_of(runs[::2]) == 1
+
+
+def test_a_reason_is_told_only_where_promise_and_run_differ(demo, run):
+    kept, other = demo["promise"].kept, run("uncompensated", 1e-6)
+    assert "zero" not in kept(8e-9, [other, run("SLPI with causes", 0.0)])
+    slope = np.gradient(Y, T)
+    for error, cause, size in [
+        (50e-9, "zero", 50.0), (-5e-3 * slope, "time", 5.0), (0.02 * (Y - Y.mean()), "sensitivity", 2.0),
+    ]:  # fmt: skip
+        found = re.search(r"it is the (\w+).* ([\d.-]+) (?:nm|ms late|%):", kept(8e-9, [other, run("causes", error)]))
+        assert found[1] == cause and float(found[2]) == pytest.approx(size, rel=0.1)
+    # The model with causes is as promised, but another one is better.
+    assert "with SLPI" in kept(8e-9, [other, run("SLPI", -0.2e-9), run("SLPI with causes", 1e-9)])

@@ -14,8 +14,8 @@ case "$name" in
     '') versions='3.11 3.12' pins=requirements/lock.txt ;;
     jazzy) versions=3.12 pins='requirements/lock.txt requirements/jazzy.txt' ;;
     minimum) versions=3.11 pins='requirements/lock.txt requirements/jazzy.txt requirements/minimum.txt' ;;
-    newest) versions='3.12 3.13' preferred=3.13 pins= ;;
-    kilted) versions='3.12 3.13' preferred=3.13 pins= distro=kilted ;;
+    newest) versions='3.12 3.13 3.14' preferred=3.13 pins= ;;
+    kilted) versions='3.12 3.13 3.14' preferred=3.13 pins= distro=kilted ;;
     *) fail "no environment '$name'; give jazzy, minimum, newest or kilted" ;;
 esac
 venv=.venv${name:+-$name}

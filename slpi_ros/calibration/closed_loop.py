@@ -20,7 +20,7 @@ from slpi_ros.model.limits import Limits, RateLimiter
 from slpi_ros.model.sensor import StreamingSensor
 from slpi_ros.model.stage_model import StageModel
 
-# Steps about the middle, and a raster, as shares of the displacement range; time of each set point, and of a period of
+# Steps about the middle, and a raster, as shares of the displacement range; time of each setpoint, and of a period of
 # the raster if the slew limit allows it, seconds; number of periods.
 STEPS, RASTER, HOLD, PERIOD, PERIODS = (0.02, 0.1), 0.3, 1.0, 1.0, 2
 # Share of the slew limit that a raster takes where the inverse has its mean slope.

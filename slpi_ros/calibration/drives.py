@@ -136,7 +136,7 @@ def compensated(
     gap = np.full(len(swept), np.nan), np.full(len(back), np.nan)
     wanted = {axis: np.concatenate([gap[0], y, gap[1]]) for axis, y in zip(settings.axes, paths, strict=True)}
     path = "The desired path" if settings.path else "A path that no record holds"
-    why = f"{path}, through the compensator: what the model is worth."
+    why = f"{path}, through the compensator: the error of the model."
     drive = _drive(settings, voltage, why, limited=False)
     return drive, {axis: np.pad(y, (0, drive.t.size - y.size), constant_values=np.nan) for axis, y in wanted.items()}
 

@@ -509,7 +509,7 @@ def why(verified: Sequence[Mapping[str, TrackingError]], diagnosis: Diagnosis, e
     effects: Sequence[Effect] = [each.effect for each in diagnosis.axes[name].effects]
     lasting = [effect.name for effect in effects if effect.needs_feedback and not effect.shift]
     if lasting:
-        said.append(f"{', '.join(lasting)} cannot be undone without feedback and will go on")
+        said.append(f"{', '.join(lasting)} cannot be compensated without feedback")
     if late := sum(effect.shift for effect in effects):
         # On the path of the verification it is undone.
         said.append(f"the delay of {late * 1e3:.3g} ms is undone on a trajectory, and not by setpoints one by one")

@@ -272,8 +272,8 @@ def _evidence(effect: Effect, named: Named, answer: Answer) -> str:
     )
     on = "records left out" if len(answer.now.evidence.parts) > 1 else "parts left out"
     gained = (
-        f"{effect.describe()}; held-out error, on the {on}: {before} before, {after} rms with it; all effects found "
-        f"{end}, the same without this one {without} (p = {named.p_value:.2g} that chance gains as much)"
+        f"{effect.describe()}; held-out error on the {on}: {before} rms before, {after} with it; with all effects "
+        f"found {end}, with all but this one {without} (p = {named.p_value:.2g})"
     )
     if not named.rivals:
         return gained
@@ -334,7 +334,7 @@ def _of_given(given: Given, answer: Answer, before_rms: float) -> str:
 
 def _in_model(now: Explanation, effects: Sequence[NamedEffect], dropped: Sequence[str]) -> str:
     own = [effect.name for effect in now.effects if isinstance(effect, EachRecord)]
-    said = f" Each record has its own, so not in the extended model: {', '.join(own)}." if own else ""
+    said = f" Not in the extended model, as it differs from record to record: {', '.join(own)}." if own else ""
     if undecided := [named.name for named in effects if named.alternatives and named.name not in own]:
         said += (
             f" In the extended model as one of several possible causes: {', '.join(undecided)}; proved at the drive "

@@ -11,7 +11,7 @@ from slpi_ros.arrays import FloatArray
 from slpi_ros.compensator.loop_design import HALF, NOISES, SETTLED
 from slpi_ros.effects.filters import Uniform
 
-# Fewest samples for which a set point is held before and after a step.
+# Fewest samples for which a setpoint is held before and after a step.
 HELD = 20
 # Steps are of one size up to this ratio.
 ALIKE = 1.1
@@ -28,7 +28,7 @@ class StepAnswer:
 
     size: float  # m, median magnitude
     count: int
-    overshoot: float  # beyond the set point, over the size
+    overshoot: float  # beyond the setpoint, over the size
     settled: float | None  # s, until the error stays within 1 % of the step; None: not before the next one
     quiet: float | None  # s, until it stays within the noise
 
@@ -49,7 +49,7 @@ def step_answers(t: FloatArray, desired: FloatArray, error: FloatArray, noise_rm
     held = np.flatnonzero(np.diff(edges) >= HELD)
     begins, ends = edges[held], edges[held + 1]
     found: list[tuple[float, float, float | None, float | None]] = []
-    # A set point that is read between two messages moves within a few samples.
+    # A setpoint that is read between two messages moves within a few samples.
     for k in np.flatnonzero(begins[1:] - ends[:-1] < HELD):
         at, to = slice(int(ends[k]), int(ends[k + 1])), float(desired[begins[k + 1]])
         step = to - float(desired[at.start - 1])

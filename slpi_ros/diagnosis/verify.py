@@ -562,7 +562,7 @@ def _summary(records: Sequence[RecordVerification], resolution: float) -> AxisVe
 
     return AxisVerification(
         overall=ErrorPart.of("all", np.concatenate([one.left + one.constant for one in records])),
-        rest=ErrorPart.of("all, without the constant", np.concatenate([one.left for one in records])),
+        rest=ErrorPart.of("all, without offset", np.concatenate([one.left for one in records])),
         resolution=resolution,
         records=tuple(records),
         by_level=cut(level_classes(level)),

@@ -210,6 +210,9 @@ LOWEST, SLOWEST, HIGHEST, LINES, OTHERS = 10.0, 3.0, 0.45, 4, 10
 DAMPINGS, WELL_DAMPED = (0.02, 0.08), (0.08, 0.5, 1.5)
 # Step of the derivatives by frequency, as a share of the half bandwidth, and by damping, as a share of that.
 STEP = 0.05
+# Largest damping ratio of a mode from one drive frequency, up to this ratio of those of several records: a mode that
+# hardly rings is a lag or a delay there.
+AT_ONE_SPEED, ONE_SPEED = 0.3, 1.25
 # Highest frequency of any mode, as a multiple of the highest excited frequency; above it only sharp ones can be
 # identified, with at most this damping ratio: turns excite them, and others only shift in time.
 RINGS, SHARP = 2.0, 0.1
@@ -281,9 +284,13 @@ class Resonance(EffectBase):
         return Resonance(_within(modes)) if len(modes) <= MOST_MODES else None
 
     def plausible(self, context: FitContext) -> bool:
-        """Return whether the modes far above the excited frequencies ring sharply: others shift in time."""
-        highest = RINGS * context.excited_frequency()
-        return all(mode.frequency <= highest or mode.damping <= SHARP for mode in self.modes)
+        """Return whether modes ring that are far above the excited frequencies, or from a single drive frequency.
+
+        Others shift in time, as a lag or a delay.
+        """
+        highest, drives = RINGS * context.excited_frequency(), [frequency for frequency, _ in context.drives()]
+        most = AT_ONE_SPEED if max(drives) < ONE_SPEED * min(drives) else inf
+        return all(mode.damping <= (most if mode.frequency <= highest else SHARP) for mode in self.modes)
 
     @property
     def rest(self) -> float:

@@ -18,8 +18,12 @@ HELD = 0.3
 _BETTER = 0.7
 # Share of changes by more than one digit below which it makes no difference whether readings are held.
 _ABOVE = 0.1
-# Rows that are compared.
-_ENOUGH = 40_000
+# Ratio of rows from which a run is longer than usual, and a sensor has another rate.
+_OTHER = 1.5
+# A record is searched for changes of that rate in parts down to this one.
+_PARTS = 16
+# Rows that are compared, and the ratio by which they are spread.
+_ENOUGH, _GOLDEN = 40_000, (np.sqrt(5.0) - 1.0) / 2.0
 # Rows on either side from which the speed is taken: this many readings, and limits.
 _READINGS, _LEAST, _MOST = 3, 4, 20_000
 # Standard deviations of the noise, in digits, and shares of repeated rows that are tried.
@@ -49,11 +53,67 @@ class Held:
 def held_readings(y: FloatArray, v: FloatArray) -> Held:
     """Find the readings of a displacement (m) that are fresh, at voltages (V), both finite, of shape (N,).
 
+    A sensor that changes its rate is judged before and after the change by itself.
+    """
+    if y.size < FEWEST or np.count_nonzero(y[1:] == y[:-1]) <= HELD * (y.size - 1):
+        return Held(np.ones(y.size, dtype=bool), 1.0)
+    fresh, rates = _fresh(y, v, _rows(y, v)[0], y.size // _PARTS)
+    return Held(fresh, rates[0] if len(set(rates)) == 1 else y.size / np.count_nonzero(fresh))
+
+
+def _fresh(y: FloatArray, v: FloatArray, rows: float, shortest: int) -> tuple[Mask, list[float]]:
+    """Return the fresh readings of a part of a record, (N,), and the rows that each one lasts, of all its parts."""
+    at = _change(y)
+    own = _rows_of_parts(y, v, at, rows)
+    changed = max(own) > _OTHER * min(own)
+    if not changed:
+        # Of changes that undo each other one half shows more.
+        at, own = y.size // 2, (rows, rows)
+    if changed or at >= shortest:
+        first, before = _fresh(y[:at], v[:at], own[0], shortest)
+        last, after = _fresh(y[at:], v[at:], own[1], shortest)
+        if len({*before, *after}) > 1:
+            return np.concatenate([first, last]), before + after
+    return (_with_fresh(y, rows) if rows > 1.0 else np.ones(y.size, dtype=bool)), [rows]
+
+
+def _rows_of_parts(y: FloatArray, v: FloatArray, at: int, rows: float) -> tuple[float, float]:
+    """Return the rows that each reading lasts before and after row `at`, `rows` where nothing speaks for others."""
+    usual = _usual(y[:at]), _usual(y[at:])
+    if max(usual) <= _OTHER * min(usual):
+        return rows, rows
+    before, after = _rows(y[:at], v[:at]), _rows(y[at:], v[at:])
+    # Digits make the runs of a slow stage longer, too: the likelihood says then that fewer rows are repeated.
+    one, other = (each if 1.0 < each < _OTHER / (1.0 - share) else rows for each, share in (before, after))
+    return one, other
+
+
+def _usual(y: FloatArray) -> float:
+    """Return the mean number of rows, at least 1, from change to change of readings, without the longest ones."""
+    runs = np.diff(np.flatnonzero(np.diff(y)))
+    # A run that is longer than usual is of several readings with the same digits.
+    return float(np.mean(runs[runs <= max(_OTHER * np.median(runs), 2.0)])) if runs.size else 1.0
+
+
+def _change(y: FloatArray) -> int:
+    """Return the row before and after which the numbers of rows from change to change differ most."""
+    at = np.flatnonzero(np.diff(y))
+    if at.size < FEWEST:
+        return 0
+    size = np.log(np.diff(at))
+    count = np.arange(1, size.size)
+    differ = np.abs(np.cumsum(size - size.mean())[:-1]) / np.sqrt(count * (size.size - count))
+    return int(at[1 + np.argmax(differ)]) + 1
+
+
+def _rows(y: FloatArray, v: FloatArray) -> tuple[float, float]:
+    """Return the rows that each reading lasts, 1 if none is held, and the share that the likelihood says repeat.
+
     Equal readings in a row also come from coarse digits. Explanations of all changes from row to row are compared by
     their likelihood: fresh readings with noise and digits, of a stage that moves at its speed; or readings of which a
     share repeats the one before, or all but every k-th one, so that a change follows all of the motion since the last.
     """
-    none = Held(np.ones(y.size, dtype=bool), 1.0)
+    none = 1.0, 0.0
     same = y[1:] == y[:-1]
     at = np.flatnonzero(~same)
     if y.size < FEWEST or at.size < FEWEST // 4 or np.count_nonzero(same) <= HELD * same.size or not np.ptp(v):
@@ -73,7 +133,9 @@ def held_readings(y: FloatArray, v: FloatArray) -> Held:
     before = at[np.maximum(np.cumsum(~same) - ~same - 1, 0)]
     since = way[1:] - way[before + 1]
     chosen = np.flatnonzero(judged)
-    chosen = chosen[:: max(1, chosen.size // _ENOUGH)]
+    if chosen.size > _ENOUGH:
+        # Spread evenly, but not every k-th row: of readings that last for k rows these would all be of one age.
+        chosen = chosen[np.unique((np.arange(_ENOUGH) * _GOLDEN % 1.0 * chosen.size).astype(np.intp))]
     equal, changed = chosen[same[chosen]], chosen[~same[chosen]]
     if changed.size < FEWEST // 4:
         return none
@@ -96,10 +158,9 @@ def held_readings(y: FloatArray, v: FloatArray) -> Held:
     best, share = max((best, share), (float(regular), 1.0 - 1.0 / every))
     if share < HELD or best - max(fresh) < _BETTER * changed.size:
         return none
-    # A run that is longer than usual is of several readings with the same digits.
-    rows = float(np.mean(runs[runs <= max(1.5 * np.median(runs), 2.0)]))
+    rows = _usual(y)
     # Where most runs are shorter the repeats are those of a stage at rest.
-    return _with_fresh(y, rows) if 1.0 - 1.0 / rows >= HELD else none
+    return (rows, share) if 1.0 - 1.0 / rows >= HELD else none
 
 
 def _regular(runs: NDArray[np.intp]) -> int:
@@ -109,14 +170,14 @@ def _regular(runs: NDArray[np.intp]) -> int:
     return max(tried, key=lambda every: np.count_nonzero(runs % every == 0) * np.log(every))
 
 
-def _with_fresh(y: FloatArray, rows: float) -> Held:
-    """Return the fresh readings where each one is held for some rows."""
+def _with_fresh(y: FloatArray, rows: float) -> Mask:
+    """Return the fresh readings, (N,), where each one is held for some rows."""
     at = np.arange(y.size)
     new = np.diff(y, prepend=np.nan) != 0.0
     # What stays equal for longer was read anew, with the same digits.
     age = at - np.maximum.accumulate(np.where(new, at, 0))
-    again = (np.floor(age / rows) > np.floor((age - 1) / rows)) & (age >= 1.5 * rows)
-    return Held(new | again, rows)
+    again = (np.floor(age / rows) > np.floor((age - 1) / rows)) & (age >= _OTHER * rows)
+    return np.asarray(new | again)
 
 
 def without_held(record: Record, axis: str) -> tuple[Record, float]:

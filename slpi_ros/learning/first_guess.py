@@ -86,7 +86,7 @@ def known_modes(axis: AxisModel, dt: float) -> list[Mode]:
         found += [Mode.of(mode.frequency, mode.damping, dt) for mode in getattr(effect, "modes", ())]
         own = effect.inverse_modes() if hasattr(effect, "inverse_modes") else ()
         found += [Mode.of(zero.frequency, zero.damping, dt, exact=True) for zero in own]
-    return [mode for mode in found if mode.angle < HIGHEST_ANGLE]
+    return [mode for mode in found if 0.0 < mode.angle < HIGHEST_ANGLE]
 
 
 class _Test:

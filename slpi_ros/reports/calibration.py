@@ -44,10 +44,8 @@ def page_of(outcome: Outcome) -> Page:
         "measured - desired; what counts is the latest verification."
     )
     page.table(
-        ("", "error before and after", *outcome.errors),
+        ("verification", "axis", "model", "mean error", "of the stroke", "maximum", "offset", "mean without it"),
         _errors(outcome),
-        None,
-        "Mean and maximum error; mean without the offset.",
     )
     for axis, error in outcome.errors.items():
         found = outcome.diagnosis.axes[axis]
@@ -70,7 +68,7 @@ def page_of(outcome: Outcome) -> Page:
         page.heading(f"Feedback of axis {axis}", f"{axis}-loop")
         page.text(f"At {outcome.settings.rate:g} Hz, in {GAINS}: {loop.told}.")
         if loop.design:
-            page.lines([*describe(outcome.model.axis(axis), loop.design), *describe_measured(loop.design, None)])
+            page.lines([*describe(outcome.model.axis(axis), loop.design)[1:], *describe_measured(loop.design, None)])
         show_steps(page, axis, loop.steps)
     page.heading("What was recorded, why, and what it showed")
     rows = [
@@ -83,18 +81,18 @@ def page_of(outcome: Outcome) -> Page:
 
 
 def _errors(outcome: Outcome) -> list[list[str]]:
-    """Return a row for each verification: mean and maximum error of each axis."""
+    """Return a row for each axis in each verification."""
     return [
         [
             step.name,
-            "hysteresis alone" if number == 0 else "with the causes found",
-            *(
-                f"{length(error.mean)} ({error.mean / error.stroke:.3%}), {length(error.maximum)}; {length(error.rest)}"
-                for error in step.errors.values()
-            ),
+            axis,
+            "with the causes found" if number else "hysteresis alone",
+            length(error.mean),
+            f"{error.mean / error.stroke:.3%}",
+            *map(length, (error.maximum, error.offset, error.rest)),
         ]
         for number, step in enumerate(step for step in outcome.steps if step.errors)
-        if step.errors
+        for axis, error in (step.errors or {}).items()
     ]
 
 

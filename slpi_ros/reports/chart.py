@@ -12,19 +12,22 @@ import numpy as np
 from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.errors import shown
 
-MEASURED, DESIRED, NOISE = "#8a97a5", "#1b2733", "#c9d2da"
-COLOURS = ("#c8553d", "#d99a26", "#2a7f62", "#3b6ea5")
+# Colours of one chart differ in lightness, too: printed in grey they are still different.
+MEASURED, DESIRED, NOISE = "#a3aebb", "#1b2733", "#c9d2da"
+COLOURS = ("#d6654a", "#d99a26", "#1b6049", "#2b5c93")
 # Colours of unused samples: their time span, the measurement, and the model.
 UNUSED_SHADE, UNUSED_MEASURED, UNUSED_MODEL = "#fbeccb", "#e6cc94", "#b98a2f"
 BEFORE, AFTER = COLOURS[0], COLOURS[2]
 # Colours of causes, in the order of their weight; distinct from BEFORE and AFTER.
-CAUSES = ("#3b6ea5", "#d99a26", "#8d5fb0", "#1f9aa6", "#b5467d", "#7a6a53")
+CAUSES = ("#3b6ea5", "#e0a83a", "#6b3f8f", "#35a9b5", "#b5467d", "#b9a78f")
 # Sequential colour scales for counts and errors: dark on white, suitable for colour blindness.
 SCALE = ((0.0, "#c3d8ea"), (0.5, "#5b8db8"), (1.0, "#173a5c"))
 ERROR_SCALE = ((0.0, "#c9e4d8"), (0.5, "#e0b04a"), (1.0, "#a8321c"))
 
 # Largest number of points of a line, and of dots of a scatter plot, each of which is an element of the page.
 LINE_POINTS, CLOUD_POINTS = 5000, 1500
+# Up to so many dots are drawn large.
+_FEW = 50
 # Spacing between panels, and margins for the axis titles, pixels.
 _GAP = {"row": 80, "column": 62}
 _MARGIN = {"l": 75, "r": 15, "t": 46, "b": 56}
@@ -138,7 +141,8 @@ class Chart:
 
     def dots(self, panel: int, name: str, x: FloatArray, y: FloatArray, colour: str, *, faint: bool = False) -> None:
         """Add points, shape (N,) each, SI; `faint` points belong to a line of the same name, which is added later."""
-        style = {"mode": "markers", "marker": {"color": colour, "size": 3, "opacity": 0.3 if faint else 0.55}}
+        look = {"size": 3, "opacity": 0.3 if faint else 0.55} if x.size > _FEW else {"size": 8, "opacity": 1.0}
+        style = {"mode": "markers", "marker": {"color": colour, **look}}
         self._add(panel, name, x, y, {"type": "scatter", **style}, keyed=not faint)
 
     def steps(self, panel: int, name: str, edges: FloatArray, counts: FloatArray, colour: str) -> None:

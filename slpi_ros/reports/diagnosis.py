@@ -54,11 +54,14 @@ def write_files(folder: Path, diagnosis: Diagnosis) -> None:
 
 def page_of(diagnosis: Diagnosis) -> Page:
     """Return the page of a diagnosis."""
-    page = Page(f"Diagnosis of {diagnosis.source or 'a record'}")
+    stage = diagnosis.extended.hardware_id
+    page = Page("Diagnosis" + (f" of stage {stage}" if stage else ""))
     page.contents(tuple(diagnosis.axes))
+    if diagnosis.source:
+        page.text(f"Records: {diagnosis.source}")
     for name, found in diagnosis.axes.items():
         page.heading(f"Axis {name}", name)
-        page.verdict(name, f"Axis {name}: {found.summary}", _severity(found), found.verdict)
+        page.verdict(name, found.summary, _severity(found), found.verdict)
         page.tiles(_figures(found))
         _show_causes(page, found)
         _show_left(page, name, found)
@@ -79,7 +82,7 @@ def _severity(found: AxisDiagnosis) -> Severity:
 def _figures(found: AxisDiagnosis) -> dict[str, str]:
     figures = {
         "error of the given model, rms": length(found.given_rms),
-        "its hysteresis refitted": length(found.before_rms),
+        "refitted hysteresis": length(found.before_rms),
     }
     if found.effects:
         figures["with the identified effects"] = length(found.after_rms)
@@ -166,9 +169,10 @@ def _colours(count: int) -> list[str]:
 
 
 def _cause(named: NamedEffect) -> dict[str, str]:
+    described = named.effect.describe()
     said = {
-        "Description": named.effect.describe(),
-        "Evidence": named.evidence,
+        "Description": described,
+        "Evidence": named.evidence.removeprefix(f"{described}; "),
         "Gain": f"{named.gain_percent:.1f} % less held-out error; "
         f"{named.share_of_residual:.0%} of the mean square error without effects",
         "p-value": f"{named.p_value:.2g}",
@@ -220,7 +224,7 @@ def _steps(found: AxisDiagnosis) -> tuple[list[list[str]], int, str]:
         times = f"{error / found.noise_rms:.2f}" if found.noise_rms > 0.0 else ""
         return [name, f"{error * 1e9:.1f}", times, gain]
 
-    rows = [row("given model", found.given_rms), row("its hysteresis, refitted", found.before_rms)]
+    rows = [row("given model", found.given_rms), row("refitted hysteresis", found.before_rms)]
     error = found.before_rms
     for named in found.effects:
         error *= 1.0 - named.gain_percent / 100.0

@@ -48,7 +48,7 @@ def write_report(
     for name, axis in model.axes.items():
         told = (held_out or {}).get(name)
         page.heading(f"Axis {name}", name)
-        page.verdict(name, *_verdict(name, axis, told))
+        page.verdict(name, *_verdict(axis, told))
         page.tiles(_figures(axis, told))
         if told is not None:
             _show_held_out(page, name, told)
@@ -76,7 +76,7 @@ def write_report(
     return path
 
 
-def _verdict(name: str, axis: AxisModel, held_out: CrossValidationReport | None) -> tuple[str, Severity]:
+def _verdict(axis: AxisModel, held_out: CrossValidationReport | None) -> tuple[str, Severity]:
     """Return a sentence on the held-out error, and its severity."""
     quality = axis.quality
     error, floor = quality.held_out_rms, quality.floor_rms
@@ -88,7 +88,7 @@ def _verdict(name: str, axis: AxisModel, held_out: CrossValidationReport | None)
         if np.isfinite(held_out.overall.classical_rms) and held_out.kind != CLASSICAL:
             beside = f" Classical PI: {length(held_out.overall.classical_rms)}."
     share = f"{error / _stroke(axis):.3%}" if _stroke(axis) > 0.0 else "?"
-    said = f"Axis {name}: the held-out error is {length(error)} rms ({share} of the stroke)"
+    said = f"The held-out error is {length(error)} rms ({share} of the stroke)"
     if not floor > 0.0:
         return f"{said}; the record has no noise for comparison.{beside}", "warn"
     if error <= ABOVE_NOISE * floor:

@@ -24,6 +24,8 @@ if TYPE_CHECKING:
 _LONGEST_TEXT = 20_000
 # Length (characters) above which the column of a table holds text and not numbers.
 _SENTENCE = 36
+# A table with more columns, or with a longer word, is too wide for a telephone: its rows become lists there.
+_MOST_COLUMNS, _LONGEST_WORD = 5, 20
 
 Severity = Literal["good", "warn", "bad"]
 
@@ -132,16 +134,22 @@ class Page:
         links: Mapping[str, str] | None = None,
     ) -> None:
         """Add a table; row `best` is highlighted, a row of text is a group heading, first cells may be `links`."""
-        below = f"<caption>{_prose(caption)}</caption>" if caption else ""
+        below = f"<figcaption>{_prose(caption)}</figcaption>" if caption else ""
         cells_of = [row for row in rows if not isinstance(row, str)]
         # Sentences and paths are aligned like text and broken into lines; numbers are neither.
         worded = {k for row in cells_of for k, cell in enumerate(row) if k and len(cell) > _SENTENCE}
 
+        longest = max((len(word) for row in cells_of for cell in row for word in cell.split()), default=0)
+        wide = worded or len(header) > _MOST_COLUMNS or longest > _LONGEST_WORD
+        names = [_text(cell) for cell in header]
+
         def line(tag: str, texts: Sequence[str]) -> str:
-            marks = (' class="words"' if k in worded else "" for k in range(len(texts)))
+            marks = [' class="words"' if k in worded else "" for k in range(len(texts))]
+            if tag == "td" and wide:
+                marks = [f'{mark} data-name="{name}"' for mark, name in zip(marks, names, strict=True)]
             return "".join(f"<{tag}{mark}>{text}</{tag}>" for mark, text in zip(marks, texts, strict=True))
 
-        head = line("th", [_text(cell) for cell in header])
+        head = line("th", names)
         body = []
         for k, row in enumerate(rows):
             if isinstance(row, str):
@@ -153,7 +161,8 @@ class Page:
             cells = line("td", texts)
             body.append(f'<tr class="best">{cells}</tr>' if k == best else f"<tr>{cells}</tr>")
         rows_below = f"<thead><tr>{head}</tr></thead><tbody>{''.join(body)}</tbody>"
-        self._parts.append(f'<div class="scroll"><table>{below}{rows_below}</table></div>')
+        kind = ' class="wide"' if wide else ""
+        self._parts.append(f'<figure><div class="scroll"><table{kind}>{rows_below}</table></div>{below}</figure>')
 
     def figure(self, figure: "Figure", caption: str) -> None:
         """Add a picture with its caption."""

@@ -37,30 +37,34 @@ UNKNOWN = (
     "record of slpi excite --for-response, or a model of slpi diagnose"
 )
 HELP = {
-    "mode": "a stiffer or better damped mount, or less load, moves that",
-    "delay": "a faster sensor, driver or link moves that",
-    "rate": "readings and output_rate of four times as much move that",
+    "mode": "a stiffer or better damped mount, or less load, raises it",
+    "delay": "a faster sensor, driver or link raises it",
+    "rate": "raise output_rate, and the rate of the readings",
 }
 
 
 def describe(axis: AxisModel, found: Design) -> list[str]:
     """Return what was found for an axis, as lines of text."""
+    detuned = f"each mode {DETUNING:.0%} off and " if any(effect.ringing for effect in axis.effects) else ""
+    return [
+        f"bandwidth {found.bandwidth:.3g} Hz of small motions, modulus margin {found.margin:.2f} with {detuned}the "
+        "slope of the largest loop",
+        _gains(found),
+        f"a step of a tenth of the stroke, by feedback alone, is within 1 % after {_time(_settling(axis, found)[0])}, "
+        f"within the noise after {_time(_settling(axis, found)[1])}",
+        f"the sensor's noise of {length(axis.quality.floor_rms)} moves the stage by {length(found.noise)} rms",
+        *limits(axis, found),
+    ]
+
+
+def _gains(found: Design) -> str:
     gains = found.gains
     filters = [
         f"notch at {one.frequency:.4g} Hz (damping {one.damping:.3g}, width {one.width:.3g})" for one in gains.notches
     ]
     if gains.measurement_filter:
         filters.append(f"measurement_filter {gains.measurement_filter * 1e3:.3g} ms")
-    detuned = f"each mode {DETUNING:.0%} off and " if any(effect.ringing for effect in axis.effects) else ""
-    return [
-        f"bandwidth {found.bandwidth:.3g} Hz of small motions, modulus margin {found.margin:.2f} with {detuned}the "
-        "slope of the largest loop",
-        f"ki {gains.integral:.3g} V/(m s), kp {gains.proportional:.3g} V/m{''.join(f', {each}' for each in filters)}",
-        f"a step of a tenth of the stroke, by feedback alone, is within 1 % after {_time(_settling(axis, found)[0])}, "
-        f"within the noise after {_time(_settling(axis, found)[1])}",
-        f"the sensor's noise of {length(axis.quality.floor_rms)} moves the stage by {length(found.noise)} rms",
-        *limits(axis, found),
-    ]
+    return f"ki {gains.integral:.3g} V/(m s), kp {gains.proportional:.3g} V/m{''.join(f', {each}' for each in filters)}"
 
 
 def describe_measured(found: Design, measured: FrequencyResponse | None) -> list[str]:
@@ -81,8 +85,8 @@ def limits(axis: AxisModel, found: Design) -> list[str]:
     """Return what limits the bandwidth, and what would help."""
     lines = []
     for name, without in found.limits.items():
-        relieved = "with four times as much" if name == "rate" else "without"
-        lines.append(f"limited by {_cause(name, found)}: {without:.3g} Hz {relieved}; {HELP[name]}")
+        relieved = "at four times the rate" if name == "rate" else "without"
+        lines.append(f"bandwidth limited by {_cause(name, found)}: {without:.3g} Hz {relieved}; {HELP[name]}")
     if found.noise > axis.quality.held_out_rms:
         lines.append(
             "limited by the noise: it moves the stage by more than the model is off "
@@ -138,7 +142,7 @@ def write_files(
         axis = model.axes[name]
         page.heading(f"Axis {name}", name)
         said = limits(axis, one)
-        page.verdict(name, f"{one.bandwidth:.3g} Hz, {said[0] if said else 'limited by the margin'}", "good")
+        page.verdict(name, f"{one.bandwidth:.3g} Hz; {said[0] if said else 'bandwidth limited by the margin'}", "good")
         settled, to_noise = _settling(axis, one)
         page.tiles(
             {
@@ -149,7 +153,8 @@ def write_files(
                 "noise at the stage": length(one.noise),
             }
         )
-        page.lines([*describe(axis, one), *describe_measured(one, measured.get(name))])
+        # What verdict and tiles say is not said again.
+        page.lines([_gains(one), *said[1:], *describe_measured(one, measured.get(name))])
         _show(page, name, axis, one, measured.get(name))
     page.write(folder / FILES[0])
 

@@ -52,6 +52,8 @@ PARTS = {
     "command": "other voltages than the model's", "model": "hysteresis", "noise": "noise and interference",
 }  # fmt: skip
 _SMALLEST_PART = 0.1
+# Fewest sizes of steps of which a chart is drawn.
+_FEWEST_SIZES = 3
 # Largest number of times that are told.
 MOST_TIMES = 3
 LINES, ZERO = "line interference or vibration", "the zero"
@@ -66,11 +68,18 @@ def write_files(folder: Path, found: Verification) -> None:
     page.contents(tuple(found.axes))
     for name, axis in found.axes.items():
         page.heading(f"Axis {name}", name)
-        page.verdict(name, _summary(name, axis), SEVERITY[axis.verdict], axis.verdict)
+        page.verdict(name, _summary(axis), SEVERITY[axis.verdict], axis.verdict)
         page.tiles(_figures(axis))
         page.section("Errors by record")
         page.table(*_records_table(axis))
-        page.lines([f"{record.error.name}: {line}" for record in axis.records for line in record_notes(record)])
+        several = len(axis.records) > 1
+        page.lines(
+            [
+                f"{record.error.name}: {line}" if several else line
+                for record in axis.records
+                for line in record_notes(record)
+            ]
+        )
         page.section("Errors by level, speed and region")
         page.table(*_parts_table(axis))
         for number, record in enumerate(axis.records):
@@ -141,7 +150,7 @@ def describe_verification(found: Verification, *, details: bool = True) -> list[
     """Return lines: for each axis the verdict and the notes of each record, in `details` errors (nm) by class."""
     lines = []
     for name, axis in found.axes.items():
-        told = [f"{axis.verdict}: " + _summary(name, axis).removeprefix(f"Axis {name}: ")]
+        told = [f"{axis.verdict}: " + _summary(axis)]
         for record in axis.records:
             error = [_error(record)] if len(axis.records) > 1 else []
             followed = _tracking_notes(record.tracking) if record.tracking else []
@@ -156,11 +165,11 @@ def describe_verification(found: Verification, *, details: bool = True) -> list[
     return lines
 
 
-def _summary(name: str, axis: AxisVerification) -> str:
+def _summary(axis: AxisVerification) -> str:
     """Return a sentence with the error and its limit, and the remedy for an axis that does not pass."""
     several = f" on the worst of {len(axis.counted)} records" if len(axis.counted) > 1 else ""
     lacking = next((record for record in axis.records if record.lacking), None)
-    said = f"Axis {name}: {f'{_lacking(lacking)} ' if lacking else ''}{_error(axis.worst)}{several}."
+    said = f"{f'{_lacking(lacking)} ' if lacking else ''}{_error(axis.worst)}{several}."
     if axis.passed:
         moved = [record for record in axis.records if record.zero_moved]
         return said + (f" The zero has moved by {_um(moved[0].offset)} µm; the loops are the same." if moved else "")
@@ -286,7 +295,7 @@ def _loop_notes(tracking: Tracking) -> list[str]:
 
 
 def _settled(seconds: float | None) -> str:
-    return "more than the set point lasts" if seconds is None else f"{seconds * 1e3:.3g} ms"
+    return "not before the next step" if seconds is None else f"{seconds * 1e3:.3g} ms"
 
 
 def _when(burst: Burst) -> str:
@@ -314,7 +323,7 @@ def _figures(axis: AxisVerification) -> dict[str, str]:
         "measured - model, rms": length(axis.overall.rms),
         "at most": length(axis.overall.maximum),
         "without offset, rms": length(axis.rest.rms),
-        f"limit of the {'rms' if worst.absolute else 'rms without the constant'}": length(worst.limit),
+        f"limit of the {'rms' if worst.absolute else 'rms without offset'}": length(worst.limit),
         "repeatability, rms": length(worst.repeatability_rms),
         "samples judged": f"{min(record.share for record in axis.records):.0%}",
         "held-out error of the model": length(axis.resolution),
@@ -325,7 +334,7 @@ def _figures(axis: AxisVerification) -> dict[str, str]:
 
 def _records_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence[str]], None, str]:
     header = (
-        "record", "", "judged", "rms (nm)", "maximum (nm)", "constant (nm)", "rest (nm)", "limit (nm)",
+        "record", "verdict", "judged", "rms (nm)", "maximum (nm)", "offset (nm)", "without it (nm)", "limit (nm)",
     )  # fmt: skip
     rows: list[Sequence[str]] = [
         (
@@ -362,7 +371,7 @@ def _parts_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence[s
         ("", "samples", "rms (nm)", "times the repeatability", "maximum (nm)"),
         rows,
         0,
-        f"All records; but for the first row without the constant of each record; repeatability {length(floor)}.",
+        f"All records; but for the first row without the offset of each record; repeatability {length(floor)}.",
     )
 
 
@@ -393,7 +402,7 @@ def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
     for cause, part in tracking.parts.items():
         if part.any():
             some = thin_line(part)
-            chart.line(1, cause, t[some], part[some], COLOUR[cause], width=1.0)
+            chart.line(1, PARTS[cause], t[some], part[some], COLOUR[cause], width=1.0)
     said = views.focus(chart, (1,), [error])
     show_steps(page, name, tracking.steps)
     page.chart(f"{name}-tracking", chart, f"Desired and measured displacement, and the parts of the error. {said}")
@@ -409,9 +418,9 @@ def show_steps(page: Page, name: str, steps: Sequence[StepAnswer]) -> None:
             (length(each.size), str(each.count), f"{each.overshoot:.1%}", _settled(each.settled), _settled(each.quiet))
             for each in steps
         ],
-        caption="Steps of the set point by their size; of each size the worst.",
+        caption="Steps of the setpoint by their size; of each size the worst.",
     )
-    if all(each.settled is None and each.quiet is None for each in steps):
+    if len(steps) < _FEWEST_SIZES or all(each.settled is None and each.quiet is None for each in steps):
         return
     chart = Chart([Panel(STEP_SIZE, SETTLING)], "column", 300)
     sizes = np.array([each.size for each in steps])

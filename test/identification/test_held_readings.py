@@ -61,6 +61,38 @@ def test_held_readings_are_found_with_their_rate(rate, seconds, digits, jitter):
         assert np.count_nonzero(found.fresh) == pytest.approx(np.count_nonzero(new), rel=0.35)
 
 
+@pytest.mark.parametrize(("noise", "digits"), [(8e-9, 1e-9), (1e-9, 1e-8)])
+@pytest.mark.parametrize("rates", [(5, 50), (50, 1, 5), (5, 20, 100, 10, 5)])
+def test_a_sensor_that_changes_its_rate_is_judged_at_each_of_them(rates, noise, digits):
+    rng = np.random.default_rng(7)
+    t, v = drive(rng, 5000, 24.0)
+    y = readings(rng, v, noise, digits)
+    parts = [held(rng, *each, jitter=False) for each in zip(np.array_split(y, len(rates)), rates, strict=True)]
+    y, new = (np.concatenate(each) for each in zip(*parts, strict=True))
+    found = held_readings(y, v)
+    assert np.count_nonzero(found.fresh & ~new) < 0.01 * np.count_nonzero(new)
+    # Of a sensor as fast as its rows digits may hide readings that are equal.
+    if 1 not in rates:
+        assert np.count_nonzero(found.fresh) == pytest.approx(np.count_nonzero(new), rel=0.02)
+        assert found.rows == pytest.approx(t.size / np.count_nonzero(new), rel=0.02)
+
+
+def test_a_stage_that_slows_down_is_no_slower_sensor():
+    rng = np.random.default_rng(8)
+    v = np.concatenate([drive(rng, 5000, 12.0, speed)[1] for speed in (120.0, 10.0)])
+    y, _ = held(rng, readings(rng, v, 1e-9, 1e-8), 5, jitter=False)
+    assert held_readings(y, v).rows == pytest.approx(5.0, rel=0.01)
+
+
+@pytest.mark.parametrize("rows", [2, 5, 10, 50])
+def test_held_readings_of_a_long_record_are_found(rows):
+    rng = np.random.default_rng(9)
+    # All that are compared have one age if they are every k-th row.
+    t, v = drive(rng, 5000, 42.0)
+    y, _ = held(rng, readings(rng, v, 8e-9, 1e-9), rows, jitter=False)
+    assert held_readings(y, v).rows == pytest.approx(rows, rel=0.01)
+
+
 @pytest.mark.parametrize("noise", [0.0, 1e-10, 1e-9, 8e-9, 3e-8])
 @pytest.mark.parametrize("digits", [0.0, 1e-9, 1e-8, 1e-7])
 def test_fresh_readings_are_never_left_out(noise, digits):

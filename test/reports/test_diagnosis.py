@@ -75,8 +75,8 @@ def written(tmp_path_factory):
 
 def test_all_is_said_without_javascript(written):
     page, text = parsed(written), written.read_text(encoding="utf-8")
-    assert page.texts["verdict-x"] == "named Axis x: creep and hum make the error."
-    assert page.texts["verdict-y"] == "nothing found Axis y: only noise is left."
+    assert page.texts["verdict-x"] == "named creep and hum make the error."
+    assert page.texts["verdict-y"] == "nothing found only noise is left."
     verdicts = [attributes["data-verdict"] for attributes in page.tags("p") if "data-verdict" in attributes]
     assert verdicts == [NAMED, NOTHING_FOUND]
     for words in (

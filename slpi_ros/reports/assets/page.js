@@ -8,10 +8,12 @@
   // Colours that would not be seen on dark paper, and theirs: text, paper, grid, axes, shades.
   const DARK = {
     "#1b2733": "#dfe6ec", "#fff": "#14191f", "#e4e9ee": "#2b343d", "#b9c4ce": "#56636f", "#c9d2da": "#46525e",
-    "#fbeccb": "#43381c", "#e6cc94": "#a08447", "#3b6ea5": "#6ea3d8", "#2a7f62": "#43b58d", "#8d5fb0": "#b48ad6",
+    "#fbeccb": "#43381c", "#e6cc94": "#a08447", "#2b5c93": "#6ea3d8", "#1b6049": "#43b58d", "#6b3f8f": "#b48ad6",
+    "#3b6ea5": "#6ea3d8",
   };
-  // Below this width (pixels) the panels of a row are placed one below the other; the width of a printed page.
-  const NARROW = 640, PRINTED = 690;
+  // Below this width (pixels) the panels of a row are placed one below the other; the width of a printed page,
+  // and the height of a chart on it as a share of that on the screen, so that it holds two.
+  const NARROW = 640, PRINTED = 688, LOWER = 0.8;
   let printing = false;
 
   function draw(figure) {
@@ -23,7 +25,7 @@
     if (dark.matches && !printing) for (const one of data) if (one.type === "heatmap") one.reversescale = true;
     // What the reader has zoomed and hidden stays.
     layout.uirevision = "kept";
-    if (printing) layout.width = PRINTED;
+    if (printing) Object.assign(layout, { width: PRINTED, height: LOWER * layout.height });
     figure.dataset.narrow = !printing && figure.clientWidth < NARROW;
     if (figure.dataset.narrow === "true") stack(data, layout);
     div.style.minHeight = `${layout.height}px`;
@@ -32,7 +34,9 @@
   }
 
   function stack(data, layout) {
-    layout.margin = { ...layout.margin, l: 70, r: 8 };
+    layout.margin = { ...layout.margin, l: 66, r: 16 };
+    // A finger that moves over a chart scrolls the page.
+    layout.dragmode = false;
     const rows = Object.keys(layout).filter((name) => /^xaxis\d*$/.test(name) && layout[name].domain);
     rows.forEach((name, k) => {
       const y = layout[name.replace("x", "y")];

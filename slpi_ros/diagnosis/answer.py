@@ -68,12 +68,13 @@ class Judge:
     """Choice of the answer among the sets of a search."""
 
     def __init__(self, search: Search) -> None:
-        self._search, self._base, self._noise = search, search.base, search.base.noise
+        self._search, self._base = search, search.base
+        self._evidence, self._noise = search.base.evidence, search.base.noise
 
     def answer(self) -> Answer:
         """Return the answer."""
         now = self._search.run()
-        self._noise = now.noise
+        self._evidence, self._noise = now.evidence, now.noise
         best = now = self._meaningful(now)
         for fitted in sorted(self._search.pool.values(), key=lambda one: (one.numbers, one.loss.square)):
             if fitted.numbers >= Fitted.of(now).numbers:
@@ -92,7 +93,7 @@ class Judge:
         return beats(one, other, self._noise, self._search.trials)
 
     def _rebuilt(self, fitted: Fitted) -> Explanation:
-        return Explanation(self._base.evidence, fitted.effects, self._base).refined(CONVERGED)
+        return Explanation(self._evidence, fitted.effects, self._base).refined(CONVERGED)
 
     def _free(self, now: Explanation) -> list[str]:
         """Return the names of the effects that were found."""

@@ -305,7 +305,8 @@ class Search:
                 break
             gained = 1.0 - best.held_out.square / now.held_out.square
             refined = best.refined(CONVERGED)
-            now = refined if refined.held_out.square < best.held_out.square else best
+            # What the effects left out of the hysteresis, it may follow more closely.
+            now = (refined if refined.held_out.square < best.held_out.square else best).smoothed()
             self._note(now)
             if gained < LEAST_GAINED:
                 break

@@ -30,7 +30,7 @@ from slpi_ros.effects.parameters import Fit, Leaf, parameter, require
 # Shortest time constant (s) of creep; shorter ones are modelled as lag.
 FASTEST = 0.1
 # Upper bounds on the gains: of each relaxation, and of the sum of those with time constants within a second.
-LARGEST, SOON, LARGEST_SOON = 0.15, 1.0, 0.12
+LARGEST, SOON, LARGEST_SOON, LARGEST_POWER = 0.15, 1.0, 0.12, 0.5
 # A gain is at its bound within this share of it.
 NEAR = 1e-3
 # Candidates: number of single relaxations; sets of several (number, longest time constant as share of the record).
@@ -100,7 +100,7 @@ class Creep(EffectBase):
     )  # fmt: skip
     gain: float = parameter(
         "", "share of a step that has followed after 1 s by the power of time", 0, 1, default=0.0, instead="gains",
-        fit=Fit("linear", 1e-5, 0.0, LARGEST_SOON, stays=0.0),
+        fit=Fit("linear", 1e-5, 0.0, LARGEST_POWER, stays=0.0),
     )  # fmt: skip
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
@@ -189,7 +189,7 @@ class Creep(EffectBase):
 
     @classmethod
     def _of_power(cls, exponent: float, gains: FloatArray) -> "Creep | None":
-        return cls(exponent=exponent, gain=float(gains[0])) if 0.0 < gains[0] < LARGEST_SOON else None
+        return cls(exponent=exponent, gain=float(gains[0])) if 0.0 < gains[0] < LARGEST_POWER else None
 
     @classmethod
     def _law(cls, taus: FloatArray, gains: FloatArray) -> "Creep | None":
@@ -228,8 +228,9 @@ class Creep(EffectBase):
 
     def plausible(self, context: FitContext) -> bool:
         """Return whether no gain, nor the sum of those that settle within a second, has ended at its upper bound."""
-        soon = sum((gain for tau, gain in zip(self.time_constants, self.gains, strict=True) if tau < SOON), self.gain)
-        return max(self.gains, default=0.0) < (1.0 - NEAR) * LARGEST and soon < (1.0 - NEAR) * LARGEST_SOON
+        soon = sum(gain for tau, gain in zip(self.time_constants, self.gains, strict=True) if tau < SOON)
+        bounds = (max(self.gains, default=0.0), LARGEST), (soon, LARGEST_SOON), (self.gain, LARGEST_POWER)
+        return all(gain < (1.0 - NEAR) * most for gain, most in bounds)
 
     def starting(self, around: EffectContext, used: Mask) -> FloatArray:
         """Return the decay of creep from a move before each record, shape (N, k), one column per unknown move."""

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from slpi_ros.diagnosis.effect_parameters import free
 from slpi_ros.diagnosis.held_out import Loss
 from slpi_ros.diagnosis.joint_fit import Explanation
+from slpi_ros.diagnosis.prepare import one_speed
 from slpi_ros.diagnosis.ruler import EXPLAINED, beats, chance, share
 from slpi_ros.diagnosis.search import CONVERGED, MOST_EFFECTS, Fitted, Form, Library, Search
 from slpi_ros.diagnosis.structures import STRUCTURES
@@ -120,10 +121,10 @@ class Judge:
         return now
 
     def _needed(self, now: Explanation, best: Explanation) -> Explanation:
-        """Return a joint fit without the effects that the best one does not need."""
+        """Return a joint fit without the effects that it, or the best one, does not need."""
         while True:
             rest = [self._without(now, name) for name in self._free(now)]
-            spare = [one for one in rest if not self._beats(best.held_out, one.held_out)]
+            spare = [one for one in rest if not all(self._beats(each.held_out, one.held_out) for each in (now, best))]
             if not spare:
                 return now
             now = min(spare, key=lambda one: (Fitted.of(one).numbers, one.held_out.square))
@@ -134,34 +135,57 @@ class Judge:
         for _ in range(MOST_EFFECTS):
             better = None
             for name in self._free(now):
-                found = self._in_its_place(now, name)
-                rivals[name] = tuple(
-                    Rival(other, fit.held_out, not self._beats(now.held_out, fit.held_out)) for other, fit in found
-                )
-                if found and found[0][1].held_out.square < now.held_out.square:
-                    better = found[0][1]
+                found, rivals[name] = self._in_its_place(now, name)
+                if found:
+                    better = found
                     break
             if better is None:
                 break
             now = better
         return now, rivals
 
-    def _in_its_place(self, now: Explanation, name: str) -> list[tuple[str, Explanation]]:
-        """Return the joint fits with another effect, of no more numbers, in the place of one, the best one first."""
-        rest, most = self._without(now, name), free(now.effect(name)).size
+    def _in_its_place(self, now: Explanation, name: str) -> tuple[Explanation | None, tuple[Rival, ...]]:
+        """Return the joint fit with a better effect in the place of one, if there is any, and all rivals."""
+        rest, effect = self._without(now, name), now.effect(name)
+        # One drive frequency does not tell effects apart that depend on time, and one record not a quantity from a
+        # drift, however many numbers they have.
+        alone, unproved = one_speed(now.evidence), bool(effect.keys) and len(now.evidence.parts) == 1
         library = Library(rest, self._search.names)
-        present = {effect.name for effect in rest.effects}
-        singles = [form for form in library.screened((), (), present | {name}) if form.numbers <= most]
+        present = {other.name for other in rest.effects} | (set() if effect.keys else {name})
+        singles = library.screened((), (), present)
+        if not (alone or unproved):
+            singles = [form for form in singles if form.numbers <= free(effect).size]
         choices = sorted((library.choice(frozenset(), (form,)) for form in singles), key=lambda one: one.square)
-        found = []
-        for choice in [one for one in choices if one.square < rest.held_out.square][:RIVALS]:
+        found, tried = list[tuple[str, Explanation]](), dict[str, int]()
+        for choice in [one for one in choices if one.square < rest.held_out.square]:
+            (form,) = choice.forms
+            tried[form.name] = tried.get(form.name, 0) + 1
+            if len(tried) > RIVALS or tried[form.name] > 1 + len(effect.keys):
+                continue
             first = library.fit(choice)
             if isinstance(first, Form):
                 continue
             fit, senseless = self._search.sensible(first.refined(CONVERGED))
-            if not senseless and Fitted.of(fit).numbers <= Fitted.of(now).numbers:
-                found.append((choice.forms[0].name, fit))
-        return sorted(found, key=lambda pair: pair[1].held_out.square)
+            if senseless or fit.effect(form.name).keys == effect.keys != ():
+                continue
+            found.append((" ".join([form.name, *fit.effect(form.name).keys]), fit))
+        found.sort(key=lambda pair: pair[1].held_out.square)
+        rivals, better = list[Rival](), None
+        for label, fit in found:
+            as_good = not self._beats(now.held_out, fit.held_out)
+            fewer = Fitted.of(fit).numbers <= Fitted.of(now).numbers
+            if (
+                as_good
+                and unproved
+                and fit.effect(label.partition(" ")[0]).courses
+                or fewer
+                and fit.held_out.square < now.held_out.square
+            ):
+                better = better or fit
+            if fewer or alone:
+                as_good = as_good or (alone and self._beats(fit.held_out, rest.held_out))
+                rivals.append(Rival(label, fit.held_out, as_good))
+        return better, tuple(rivals)
 
     def _named(self, now: Explanation, rivals: dict[str, tuple[Rival, ...]]) -> tuple[Named, ...]:
         """Return the effects, each with its gain when added to the preceding ones, the largest gain first."""
@@ -183,7 +207,7 @@ class Judge:
             return answer
         now, found = answer.now, list[tuple[float, str]]()
         for name, columns in STRUCTURES.items():
-            if answer.named and not self._beats(now.held_out, self._base.beside(columns(self._base)).held_out):
+            if answer.named and self._base.beside(columns(self._base)).held_out.square <= now.held_out.square:
                 dropped = tuple(sorted(one.name for one in answer.named))
                 return Answer(self._base, self._base, structures=(name,), dropped=dropped)
             with_it = now.beside(columns(now)).held_out

@@ -54,6 +54,8 @@ class Loop:
         self._refusal: Callable[[PidGains, float], str] = lambda gains, period: ""
         # Measured - model, with the time (ns), also where the measurement is refused.
         self._offsets: deque[tuple[int, float]] = deque(maxlen=OFFSETS)
+        # The same during the last reset, until the axis moves otherwise.
+        self.sweep: list[tuple[int, float]] = []
         # Setpoint and displacement of the model as a sensor with delay or lag reads them; None without these. Points of
         # a trajectory are output earlier by the delay of the stage.
         self._setpoint: Sensed | None = None
@@ -90,8 +92,15 @@ class Loop:
         return self._applied if self.closed else stream
 
     def offset(self, now_ns: int) -> float | None:
-        """Return the present measured - model displacement (m); None without a measurement in the last 0.2 s."""
+        """Return the present measured - model displacement (m); None without a measurement in the last 0.2 s.
+
+        Right after a reset it is the median over the reset, as the calibrator takes it over a sweep: what relaxes
+        afterwards is not in it, and what differs between rising and falling voltages cancels.
+        """
         recent = [offset for t, offset in self._offsets if now_ns - t <= OFFSET_AGE_NS]
+        # The reset counts for as long as it has taken: later the zero may have moved.
+        if recent and self.sweep and now_ns - self.sweep[-1][0] <= self.sweep[-1][0] - self.sweep[0][0]:
+            recent = [offset for _, offset in self.sweep]
         return median(recent) if recent else None
 
     # Model and settings
@@ -187,16 +196,18 @@ class Loop:
 
     # Readings
 
-    def read(self, y: float, expected: float, now_ns: int, fresh: bool, within: bool) -> float:
+    def read(self, y: float, expected: float, now_ns: int, fresh: bool, within: bool, sweeping: bool = False) -> float:
         """Take a reading (m); return the displacement (m) without the sensor's own errors.
 
         `expected` (m) is where the model is. Only a `fresh` one, stamped now, counts for the zero, and only one
-        `within` the accepted displacements is corrected.
+        `within` the accepted displacements is corrected; `sweeping`: it tells the zero of a reset.
         """
         x = self._sensor.correct(y) if within else y
         sensed = self._expected.span(now_ns) if self._expected else ()
         if fresh and isfinite(x):
             self._offsets.append((now_ns, x - (sensed[-1] if sensed else expected)))
+            if sweeping:
+                self.sweep.append(self._offsets[-1])
         return x
 
     def measure(self, x: float, expected: float, now_ns: int, watched: bool, tracking: TrackingStatistics) -> None:
@@ -239,6 +250,7 @@ class Loop:
     def forget_offsets(self) -> None:
         """Forget the offsets: the zero has moved."""
         self._offsets.clear()
+        self.sweep.clear()
 
     # Voltages
 

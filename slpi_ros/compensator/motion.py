@@ -120,6 +120,7 @@ class Motion:
 
     kind = Kind.IDLE
     follows = drives = False  # setpoints, so that feedback corrects; the voltage without setpoints
+    sweeps = False  # over the range with a known memory, so that readings tell the zero
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -281,8 +282,11 @@ class Reset(Ramp):
 
     def next(self, pace: RateLimiter, now_ns: int) -> float:
         """Return the next voltage (V)."""
+        left = len(self._goals)
         v = super().next(pace, now_ns)
         self._low, self._high = min(self._low, v), max(self._high, v)
+        # At a limit the memory is wiped: from there on readings tell the zero.
+        self.sweeps |= len(self._goals) < left
         return v
 
     def end(self, axis: Moved, now_ns: int) -> None:

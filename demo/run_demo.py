@@ -36,7 +36,8 @@ from slpi_ros.simulation.stage import Stage  # noqa: E402
 
 RATE = 100.0
 V_MIN, V_MAX, SLEW = 0.0, 100.0, 1000.0
-# The calibration runs faster than in life; the comparison is in real time, on the next day of the stage.
+# The calibration runs faster than in life; the comparison is in real time, on the next day of the stage, after it has
+# been switched on for as long as at the end of the calibration: a stage that still warms up drifts faster.
 SPEED = 4.0
 NOISE = 8e-9
 # The path stays away from the ends of what can be reached by this share: the zero may go on moving.
@@ -53,25 +54,30 @@ def wipe(stage: Operator) -> tuple[float, float]:
     return float(falling.min()), float(falling.max())
 
 
-def stage_simulator(seed: int, speed: float) -> AbstractContextManager[object]:
-    """Run a stage with one or two effects that it does not tell."""
-    return executable("stage_simulator", seed=seed, character="hidden", rate=RATE, noise_rms=NOISE, speed=speed)
+def stage_simulator(seed: int, speed: float, warm_up: float = 0.0) -> AbstractContextManager[object]:
+    """Run a stage with one or two effects that it does not tell, which has been on for `warm_up` (s)."""
+    given = {"rate": RATE, "noise_rms": NOISE, "speed": speed, "warm_up": warm_up}
+    return executable("stage_simulator", seed=seed, character="hidden", **given)
 
 
-def calibrate_itself(seed: int, folder: Path) -> float:
-    """Let the calibrator calibrate the stage into a folder; return the mean error (m) that it found at last."""
+def calibrate_itself(seed: int, folder: Path) -> tuple[float, float]:
+    """Let the calibrator calibrate the stage into a folder.
+
+    Return the mean error (m) that it found at last, and how long (s) the stage was switched on.
+    """
     given = {"voltage_min": V_MIN, "voltage_max": V_MAX, "slew_limit": SLEW, "rate": RATE, "output": str(folder)}
-    promised = None
+    promised, began = None, time.monotonic()
     node = executable("calibrator", log="info", listen=True, use_sim_time=True, **given)
     with stage_simulator(seed, SPEED), node as calibrator:
         for line in calibrator.stderr or ():
             print(line.decode(), end="", file=sys.stderr, flush=True)
             promised = re.search(r"mean error ([\d.e-]+) (nm|µm)", line.decode()) or promised
         calibrator.wait()
+        on = SPEED * (time.monotonic() - began)
     # 1 says that the target was missed, and why; there is a model nevertheless.
     if not promised or not (folder / "model.json").exists():
         raise SystemExit("demo: the calibration failed; the line above says why")
-    return float(promised[1]) * {"nm": 1e-9, "µm": 1e-6}[promised[2]]
+    return float(promised[1]) * {"nm": 1e-9, "µm": 1e-6}[promised[2]], on
 
 
 def identify(bag: Path, model: Path, kind: str) -> None:
@@ -103,9 +109,9 @@ def follow_compensated(stage: Operator, name: str, model: Path, t: FloatArray, y
         return plots.Run(name, t, y, measured, stage.held_at_limit() / y.size, stage.late / asked.size)
 
 
-def compared(seed: int, models: Mapping[str, Path], duration: float) -> list[plots.Run]:
-    """Follow a path that no record holds, without and with each model, on the next day of the stage."""
-    with stage_simulator(seed, 1.0), operator() as stage:
+def compared(seed: int, models: Mapping[str, Path], duration: float, warm_up: float) -> list[plots.Run]:
+    """Follow a path that no record holds, without and with each model, on the next day, after `warm_up` (s)."""
+    with stage_simulator(seed, 1.0, warm_up), operator() as stage:
         stage.wait_until("the stage to be ready", lambda: stage.voltage.get_subscription_count() >= 1)
         low, high = wipe(stage)
         bottom, top = low + MARGIN * (high - low), high - MARGIN * (high - low)
@@ -136,8 +142,8 @@ def write_page(
     page = Page("A piezo stage that calibrated itself")
     page.text(
         f"A simulated stage with hysteresis and hidden effects (seed {seed}) calibrated itself: it recorded what was "
-        "needed, identified a model and searched for causes of what was left. On the next day it followed a path that "
-        "no record holds. Simulator, calibrator and compensator ran as separate ROS 2 processes. Errors in the table "
+        "needed, identified a model and searched for causes of what was left. On the next day, after it had warmed up "
+        "for as long as then, it followed a path that no record holds. Simulator, calibrator and compensator ran as separate ROS 2 processes. Errors in the table "
         "include the offset, after a reset and ~/set_zero; then follow the offset and the error without it. 8 nm rms "
         "of sensor noise are included."
     )
@@ -184,7 +190,7 @@ def main() -> int:
     print(f"stage {seed} (SEED={seed} repeats it) is calibrated, {SPEED:g} times as fast as in life", flush=True)
     calibration = options.output / "calibration"
     shutil.rmtree(calibration, ignore_errors=True)
-    promised = calibrate_itself(seed, calibration)
+    promised, on = calibrate_itself(seed, calibration)
     [bag] = calibration.glob("*_calibration")
     with tempfile.TemporaryDirectory(prefix="slpi_demo_") as work:
         models = {name: Path(work) / f"{kind}.json" for kind, name in KINDS.items()}
@@ -194,7 +200,7 @@ def main() -> int:
         model = slpi_ros.load_model(calibration / "model.json")
         low, high = model.axes["x"].displacement_range
         print(f"following a new path of {options.path:g} s, {1 + len(models)} times", flush=True)
-        runs = compared(seed, models, options.path)
+        runs = compared(seed, models, options.path, on)
     rows, told = table_of(runs, high - low), hidden_and_found(seed, model) + kept(promised, runs) + out_of_reach(runs)
     page = options.output / "report.html"
     write_page(page, seed, rows, runs, told, model)

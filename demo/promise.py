@@ -36,6 +36,11 @@ def kept(promised: float, runs: Sequence[plots.Run]) -> str:
         matrix = np.column_stack(columns)
         sizes = np.linalg.lstsq(matrix, run.error, rcond=None)[0]
         left[name.format(*sizes * unit)] = float(np.abs(run.error - matrix @ sizes).mean())
+    # Modes, lags and delays act where the path accelerates.
+    strength = np.abs(np.gradient(np.gradient(run.desired, run.t), run.t))
+    calm = run.error[strength <= np.median(strength)]
+    left["the acceleration of the path, judged by the half that accelerates least"] = float(np.abs(calm).mean())
     name = min(left, key=left.__getitem__)
     late = f" {run.late:.1%} of the setpoints were sent late." * bool(run.late)
-    return f"{said}. Of zero, time and sensitivity it is {name}: without it {left[name] * 1e9:.1f} nm are left.{late}"
+    rest = f"without it {left[name] * 1e9:.1f} nm are left.{late}"
+    return f"{said}. Of zero, time, sensitivity and acceleration it is {name}: {rest}"

@@ -143,9 +143,9 @@ def write_page(
     page.text(
         f"A simulated stage with hysteresis and hidden effects (seed {seed}) calibrated itself: it recorded what was "
         "needed, identified a model and searched for causes of what was left. On the next day, after it had warmed up "
-        "for as long as then, it followed a path that no record holds. Simulator, calibrator and compensator ran as separate ROS 2 processes. Errors in the table "
-        "include the offset, after a reset and ~/set_zero; then follow the offset and the error without it. 8 nm rms "
-        "of sensor noise are included."
+        "for as long as then, it followed a path that no record holds. Simulator, calibrator and compensator ran as "
+        "separate ROS 2 processes. Errors in the table include the offset, after a reset and ~/set_zero; then follow "
+        "the offset and the error without it. 8 nm rms of sensor noise are included."
     )
     page.table(HEADER, rows, best=best_of(runs))
     page.text(told)

@@ -4,7 +4,7 @@ from collections import deque
 from collections.abc import Callable
 from functools import lru_cache, partial
 from math import isfinite
-from statistics import median
+from statistics import fmean, median
 
 from slpi_ros.compensator import loop_margin
 from slpi_ros.compensator.feedback import Drift, Feedback, LoopSettings, PidGains, ResidualWindow
@@ -22,6 +22,8 @@ from slpi_ros.model.streaming import StreamingInverse
 
 # Most measurements for the offset of an axis, and how old they may be.
 OFFSETS, OFFSET_AGE_NS = 50, SECOND_NS // 5
+# How long after a reset the zero is that of its sweep, if nothing has moved: time to call for it by hand.
+SWEEP_AGE_NS = 60 * SECOND_NS
 # The kind of a fault: the loop of the model is not stable enough.
 UNSTABLE = "unstable"
 
@@ -54,8 +56,8 @@ class Loop:
         self._refusal: Callable[[PidGains, float], str] = lambda gains, period: ""
         # Measured - model, with the time (ns), also where the measurement is refused.
         self._offsets: deque[tuple[int, float]] = deque(maxlen=OFFSETS)
-        # The same during the last reset, until the axis moves otherwise.
-        self.sweep: list[tuple[int, float]] = []
+        # The same during the last reset with the number of the swing before them, until the axis moves otherwise.
+        self.sweep: list[tuple[int, int, float]] = []
         # Setpoint and displacement of the model as a sensor with delay or lag reads them; None without these. Points of
         # a trajectory are output earlier by the delay of the stage.
         self._setpoint: Sensed | None = None
@@ -94,13 +96,14 @@ class Loop:
     def offset(self, now_ns: int) -> float | None:
         """Return the present measured - model displacement (m); None without a measurement in the last 0.2 s.
 
-        Right after a reset it is the median over the reset, as the calibrator takes it over a sweep: what relaxes
-        afterwards is not in it, and what differs between rising and falling voltages cancels.
+        Right after a reset it is that of its first swings down and up over the range, as the calibrator takes it from a
+        sweep: what relaxes afterwards is not in it, and what differs between falling and rising voltages cancels.
         """
         recent = [offset for t, offset in self._offsets if now_ns - t <= OFFSET_AGE_NS]
-        # The reset counts for as long as it has taken: later the zero may have moved.
-        if recent and self.sweep and now_ns - self.sweep[-1][0] <= self.sweep[-1][0] - self.sweep[0][0]:
-            recent = [offset for _, offset in self.sweep]
+        if recent and self.sweep and now_ns - self.sweep[-1][0] <= SWEEP_AGE_NS:
+            swings = [[offset for _, swing, offset in self.sweep if swing == each] for each in (1, 2)]
+            if all(swings):
+                return fmean(map(median, swings))
         return median(recent) if recent else None
 
     # Model and settings
@@ -196,18 +199,18 @@ class Loop:
 
     # Readings
 
-    def read(self, y: float, expected: float, now_ns: int, fresh: bool, within: bool, sweeping: bool = False) -> float:
+    def read(self, y: float, expected: float, now_ns: int, fresh: bool, within: bool, swing: int = 0) -> float:
         """Take a reading (m); return the displacement (m) without the sensor's own errors.
 
         `expected` (m) is where the model is. Only a `fresh` one, stamped now, counts for the zero, and only one
-        `within` the accepted displacements is corrected; `sweeping`: it tells the zero of a reset.
+        `within` the accepted displacements is corrected; `swing`: of a reset, with a known memory.
         """
         x = self._sensor.correct(y) if within else y
         sensed = self._expected.span(now_ns) if self._expected else ()
         if fresh and isfinite(x):
             self._offsets.append((now_ns, x - (sensed[-1] if sensed else expected)))
-            if sweeping:
-                self.sweep.append(self._offsets[-1])
+            if swing:
+                self.sweep.append((now_ns, swing, self._offsets[-1][1]))
         return x
 
     def measure(self, x: float, expected: float, now_ns: int, watched: bool, tracking: TrackingStatistics) -> None:

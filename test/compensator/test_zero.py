@@ -152,11 +152,11 @@ def test_right_after_a_reset_the_zero_is_that_of_its_sweep():
         bench.now_ns += MS
         bench.read()
     sweep = {name: pytest.approx(moved, abs=20e-9) for name, moved in MOVED.items()}
-    assert {axis.name: axis.loop.offset(bench.now_ns) for axis in controller.axes} == sweep
+    assert {axis.name: axis.loop.offsets.present(bench.now_ns) for axis in controller.axes} == sweep
     bench.now_ns += 61_000 * MS
     bench.read()
     present = {name: pytest.approx(moved + 100e-9, abs=20e-9) for name, moved in MOVED.items()}
-    assert {axis.name: axis.loop.offset(bench.now_ns) for axis in controller.axes} == present
+    assert {axis.name: axis.loop.offsets.present(bench.now_ns) for axis in controller.axes} == present
     assert controller.set_zero(bench.now_ns) == present
 
 
@@ -168,9 +168,10 @@ def test_a_setpoint_after_a_reset_ends_its_sweep():
         bench.now_ns += MS
         bench.controller.advance(bench.now_ns, bench.now_ns)
         bench.read()
-    assert bench.controller.axes[0].loop.sweep
-    bench.sample(0.2)
-    assert not bench.controller.axes[0].loop.sweep
+    bench.moved = {name: moved + 100e-9 for name, moved in MOVED.items()}
+    bench.run(0.2, 0.3, 100)
+    moved = bench.controller.set_zero(bench.now_ns)
+    assert moved == {name: pytest.approx(moved + 100e-9, abs=20e-9) for name, moved in MOVED.items()}
 
 
 def test_creep_goes_on_over_a_restart(tmp_path):

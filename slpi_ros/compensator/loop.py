@@ -13,7 +13,6 @@ from slpi_ros.compensator.sensor_rule import SensorRule
 from slpi_ros.compensator.statistics import TrackingStatistics
 from slpi_ros.compensator.zero_offsets import ZeroOffsets
 from slpi_ros.errors import SlpiError
-from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.limits import MAX_DT, Limits, RateLimiter
 from slpi_ros.model.sensor import Sensed, StreamingSensor

@@ -94,7 +94,7 @@ def scanned(name, seed, folder):
         given = {"model_file": model, "voltage_min": V_MIN, "voltage_max": V_MAX, "realtime_priority": PRIORITY}
         life.enter_context(executable("compensator", log="error", **given))
         at.await_compensator()
-        at.reset("/compensator")
+        at.call("/compensator/reset_memory")
         here = float(at.state.position[0])
         approach = here + (y[0] - here) * (1.0 - np.cos(np.linspace(0.0, np.pi, int(PATH_RATE)))) / 2.0
         topics = "[stage_state, desired_displacement]"

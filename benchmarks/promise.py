@@ -1,7 +1,7 @@
 """The error that the calibrator promises, beside that of scans five minutes later: after a reset, and after a restart.
 
-Stage time and physics are those of `calibrator.py`, without ROS between them. All errors are absolute: measured -
-desired, with the constant offset. Run it with ``make bench-promise``.
+Stage time and physics are those of `calibrator.py`, without ROS between them. All errors are measured - desired, with
+the constant offset, after ~/set_zero. Run it with ``make bench-promise``.
 """
 
 import argparse
@@ -52,18 +52,20 @@ class Operation:
         return stage.measure(stage.step(self.bench.now, self.controller.voltages.tolist()))
 
     def reset(self) -> None:
-        """Reset the memory."""
+        """Reset the memory, and set the zero."""
         controller = self.controller
         controller.reset_memory(CYCLES, RESET_RATE, [0.0] * len(self.axes), self._ns)
         while controller.mode is OperatingMode.RESETTING:
-            self._step()
+            controller.measure(self.axes, self._step(), self._ns)
             controller.advance(self._ns, self._ns)
+        controller.set_zero(self._ns)
 
     def scan(self, seed: int) -> dict[str, NDArray[np.float64]]:
         """Follow a random path; return the errors (m) of each axis."""
         paths = []
         for place, axis in enumerate(self.controller.axes):
-            low, high = self.model.axis(axis.name).displacement_range
+            assert axis.model
+            low, high = axis.model.displacement_range
             paths.append(_path(axis.stream.uncoupled_displacement, low, high, np.random.default_rng([seed, place])))
         longest = max(map(len, paths))
         desired = np.column_stack([np.pad(path, (0, longest - path.size), mode="edge") for path in paths])

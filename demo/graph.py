@@ -32,13 +32,15 @@ EXECUTABLES = (
 
 @contextmanager
 def executable(
-    name: str, *, log: str = "warn", listen: bool = False, **parameters: str | float | bool
+    name: str, *remaps: str, log: str = "warn", listen: bool = False, **parameters: str | float | bool
 ) -> Iterator[subprocess.Popen[bytes]]:
     """Run one of the package's nodes until the block ends; it gets the time to finish its work.
 
     With `listen` its log is at ``stderr`` of the process, to be read to the end.
     """
     command = [str(EXECUTABLES / name), "--ros-args", "--log-level", log]
+    for remap in remaps:
+        command += ["-r", remap]
     for key, value in parameters.items():
         command += ["-p", f"{key}:={value}"]
     process = subprocess.Popen(command, start_new_session=True, stderr=subprocess.PIPE if listen else None)
@@ -102,12 +104,12 @@ class Operator(Node):
                 raise SystemExit(f"demo: {what} did not happen within {timeout:g} s")
             time.sleep(poll)
 
-    def reset(self, compensator: str) -> None:
-        """Let a compensator sweep the stage, so that the memory is known."""
-        client = self.create_client(Trigger, f"{compensator}/reset_memory")
-        self.wait_until(f"the service of {compensator}", client.service_is_ready)
+    def call(self, name: str) -> None:
+        """Call a service that needs nothing, such as that which resets the memory, and wait for its end."""
+        client = self.create_client(Trigger, name)
+        self.wait_until(f"the service {name}", client.service_is_ready)
         answer = client.call_async(Trigger.Request())
-        self.wait_until("the reset of the memory", answer.done)
+        self.wait_until(f"the answer of {name}", answer.done)
         if not answer.result().success:
             raise SystemExit(f"demo: {answer.result().message}")
 

@@ -25,15 +25,22 @@ def kept(promised: float, runs: Sequence[plots.Run]) -> str:
     if promised / FACTOR <= mean <= promised * FACTOR and best is run:
         return f"{said}."
     # What may have changed since the calibration, by what it would leave of the error.
+    still, passed = np.ones_like(run.t), run.t - run.t[0]
     causes = {
-        "the zero, which is off by {:.1f} nm": (np.ones_like(run.t), 1e9),
-        "the time, by which the stage is {:.2f} ms late": (-np.gradient(run.desired, run.t), 1e3),
-        "the sensitivity, which is off by {:.3f} %": (run.desired - run.desired.mean(), 1e2),
+        "the zero, which is off by {:.1f} nm at the begin and moves by {:.2f} nm/s": ((still, passed), 1e9),
+        "the time, by which the stage is {:.2f} ms late": ((-np.gradient(run.desired, run.t),), 1e3),
+        "the sensitivity, which is off by {:.3f} %": ((run.desired - run.desired.mean(),), 1e2),
     }
     left = {}
-    for name, (column, unit) in causes.items():
-        size = float(column @ run.error / (column @ column))
-        left[name.format(size * unit)] = float(np.abs(run.error - size * column).mean())
+    for name, (columns, unit) in causes.items():
+        matrix = np.column_stack(columns)
+        sizes = np.linalg.lstsq(matrix, run.error, rcond=None)[0]
+        left[name.format(*sizes * unit)] = float(np.abs(run.error - matrix @ sizes).mean())
+    # Modes, lags and delays act where the path accelerates.
+    strength = np.abs(np.gradient(np.gradient(run.desired, run.t), run.t))
+    calm = run.error[strength <= np.median(strength)]
+    left["the acceleration of the path, judged by the half that accelerates least"] = float(np.abs(calm).mean())
     name = min(left, key=left.__getitem__)
     late = f" {run.late:.1%} of the setpoints were sent late." * bool(run.late)
-    return f"{said}. Of zero, time and sensitivity it is {name}: without it {left[name] * 1e9:.1f} nm are left.{late}"
+    rest = f"without it {left[name] * 1e9:.1f} nm are left.{late}"
+    return f"{said}. Of zero, time, sensitivity and acceleration it is {name}: {rest}"

@@ -66,7 +66,7 @@ class Request:
 
 @dataclass(frozen=True)
 class TrackingError:
-    """Absolute error (m) of the compensated stage on one path after a reset, measured - desired."""
+    """Error (m) of the compensated stage on one path, measured - desired, with the zero of the sweep before it."""
 
     mean: float  # of the magnitude
     rms: float
@@ -307,11 +307,17 @@ class _Calibration:
         model = with_present_zero(model, self._records)
         drive, desired = compensated(self._settings, model, len(self._steps), self._records)
         recording = self._recorded(VERIFICATION_DRIVE, drive, desired)
+        # What the zero has done between two records is no error of the model, and after a reset ~/set_zero removes it.
+        moved = moved_zeros(model, [*self._records, before_path(recording)])
         errors = {
-            axis: tracking_error(recording, axis, model, self._settings.goal(self._repeatability[axis]))
+            axis: tracking_error(recording, axis, model, self._settings.goal(self._repeatability[axis]), moved[axis])
             for axis in self._settings.axes
         }
-        finding = "; ".join(f"axis {axis}: {error.told()}" for axis, error in errors.items())
+        finding = "; ".join(
+            f"axis {axis}: {error.told()}; the zero had moved by {length(moved[axis])} since the record before"
+            for axis, error in errors.items()
+        )
+        model = model.shifted(moved)
         self._records.append(recording.record)
         self._steps.append(Step(recording.record.source, float(drive.t[-1]), drive.why, finding, errors))
         self._verified.append((model, errors))
@@ -378,13 +384,24 @@ def _from_first_move(record: Record, axis: str) -> Record:
 
 def with_present_zero(model: StageModel, records: Sequence[Record]) -> StageModel:
     """Return the model with the zero of the last of the records, which begin at the start of the model."""
+    return model.shifted(moved_zeros(model, records))
+
+
+def before_path(recording: Recording) -> Record:
+    """Return the part of a recording before its path: the sweep that makes the memory known."""
+    along = np.any([np.isfinite(desired) for desired in recording.desired.values()], axis=0)
+    return recording.record.part(slice(0, int(np.argmax(along))))
+
+
+def moved_zeros(model: StageModel, records: Sequence[Record]) -> dict[str, float]:
+    """Return by how much (m) the zero of each axis differs from the model in the last of the records."""
+    # The median over rising and falling voltages: lag, rate and width of the loops cancel.
     t, voltage = driven_so_far(records)
     seen = model.simulate(t, voltage)
     last = records[-1]
     known = np.all([np.isfinite(v) for v in last.voltage.values()], axis=0)
     read = {axis: last.displacement[axis][known] for axis in model.axes}
-    offsets = {axis: float(np.nanmedian(y - seen[axis][-y.size :])) for axis, y in read.items()}
-    return model.shifted(offsets)
+    return {axis: float(np.nanmedian(y - seen[axis][-y.size :])) for axis, y in read.items()}
 
 
 def _left_at(model: StageModel, last: Record) -> StageModel:
@@ -435,10 +452,13 @@ def _follows(axis: str, drive: Drive, record: Record, settings: CalibrationSetti
     return f"axis {axis} follows with {slope * 1e6:.3g} µm/V"
 
 
-def tracking_error(recording: Recording, axis: str, model: StageModel, goal: float) -> TrackingError:
-    """Return the error along the path of a recording, without known errors of the sensor; `goal`: mean (m) to meet."""
+def tracking_error(recording: Recording, axis: str, model: StageModel, goal: float, zero: float = 0.0) -> TrackingError:
+    """Return the error along the path of a recording, without known errors of the sensor.
+
+    `goal`: mean (m) to meet; `zero`: by how much (m) it has moved since that of the model.
+    """
     record, desired = without_held(recording.record, axis)[0], recording.desired[axis]
-    error = model.axis(axis).correct(record.t, record.displacement[axis]) - desired
+    error = model.axis(axis).correct(record.t, record.displacement[axis]) - desired - zero
     along = np.isfinite(error)
     if not along.any():
         raise RecordError(f"{record.source}: axis '{axis}': no readings along the path; check stage_state")
@@ -516,7 +536,7 @@ def why(verified: Sequence[Mapping[str, TrackingError]], diagnosis: Diagnosis, e
     if abs(worst.offset) > worst.rest:
         creeps = any(effect.unsure.slow_share for effect in effects)
         said.append(
-            f"most of it is the zero, which has moved since the record before{' and still creeps' * creeps}: before a "
-            "scan, reset the memory and call ~/set_zero of the compensator, or close the loop"
+            f"most of it is the zero, which moves from the sweep to the path{' and still creeps' * creeps}: scan soon "
+            "after a reset and ~/set_zero of the compensator, or close the loop"
         )
     return "; ".join(said if worst.met or not ended else [*said, ended])

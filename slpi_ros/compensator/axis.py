@@ -141,7 +141,7 @@ class Axis:
         self.loop.leave(self.stream)
         self.use(model, self.prepare(model))
         self.zero = zero
-        self.loop.forget_offsets()
+        self.loop.offsets.forget()
         if self.loop.closed:
             self.loop.close(self.stream, self.samples.given_ns)
 
@@ -216,6 +216,7 @@ class Axis:
         self.tracking.desired = None
         self.samples.restart()
         if motion.drives:
+            self.loop.offsets.leave_reset()
             self.loop.leave(self.stream)
             self.initial.assumed = None
         if isinstance(motion, Ramp):
@@ -256,6 +257,8 @@ class Axis:
     def note_reset(self, spanned: tuple[float, float] | None) -> None:
         """Set the confidence in the memory after a reset over voltages (V); None: it was interrupted."""
         self.confidence = MemoryConfidence(doubt=INTERRUPTED)
+        if not spanned:
+            self.loop.offsets.leave_reset()
         if spanned and self.model:
             self.confidence = MemoryConfidence(KNOWN, spanned=spanned).over(self.model.hysteresis_range)
             if self.zero.source != SENSOR:
@@ -331,6 +334,7 @@ class Axis:
         """Output and return the voltage (V) for the desired displacement `y` (m), `dt` (s) after the last step."""
         v = self._output(dt, y, self.stream.move(dt, y, now_ns), now_ns)
         self.initial.assumed = None
+        self.loop.offsets.leave_reset()
         if self.loop.closed:
             assert self.model
             self.loop.setpoint(y, now_ns, max(round(self.model.chain.delay * SECOND_NS), 0) if early else 0)
@@ -358,7 +362,7 @@ class Axis:
             return
         low, high = self.stream.accepted
         expected = self.expected
-        x = self.loop.read(displacement, expected, now_ns, fresh, low <= displacement <= high)
+        x = self.loop.read(displacement, expected, now_ns, fresh, low <= displacement <= high, self.motion.swing)
         self.check(displacement, "measured")
         if self.initial.assumed:
             if fresh:

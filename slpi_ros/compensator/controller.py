@@ -246,7 +246,7 @@ class Controller:
         self._require(Kind.TRAJECTORY, now_ns)
         self.ownership.begin_output(now_ns)
         assert self.model
-        moved = {axis.name: axis.loop.offset(now_ns) for axis in self.axes}
+        moved = {axis.name: axis.loop.offsets.present(now_ns) for axis in self.axes}
         known = {name: offset for name, offset in moved.items() if offset is not None}
         axes = [axis for axis in self.axes if axis.name in known]
         model = self.model.shifted(known)

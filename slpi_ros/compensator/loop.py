@@ -1,10 +1,8 @@
 """Sensor and feedback of one axis: readings correct its voltage, and are held against its model."""
 
-from collections import deque
 from collections.abc import Callable
 from functools import lru_cache, partial
 from math import isfinite
-from statistics import median
 
 from slpi_ros.compensator import loop_margin
 from slpi_ros.compensator.feedback import Drift, Feedback, LoopSettings, PidGains, ResidualWindow
@@ -13,15 +11,13 @@ from slpi_ros.compensator.monitor import Finding
 from slpi_ros.compensator.oscillation_rule import OscillationRule
 from slpi_ros.compensator.sensor_rule import SensorRule
 from slpi_ros.compensator.statistics import TrackingStatistics
+from slpi_ros.compensator.zero_offsets import ZeroOffsets
 from slpi_ros.errors import SlpiError
-from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.limits import MAX_DT, Limits, RateLimiter
 from slpi_ros.model.sensor import Sensed, StreamingSensor
 from slpi_ros.model.streaming import StreamingInverse
 
-# Most measurements for the offset of an axis, and how old they may be.
-OFFSETS, OFFSET_AGE_NS = 50, SECOND_NS // 5
 # The kind of a fault: the loop of the model is not stable enough.
 UNSTABLE = "unstable"
 
@@ -52,8 +48,7 @@ class Loop:
         self._held = False  # whether the correction is held, to listen to it
         # Why gains are not used with the model at an output period (s); "": they are.
         self._refusal: Callable[[PidGains, float], str] = lambda gains, period: ""
-        # Measured - model, with the time (ns), also where the measurement is refused.
-        self._offsets: deque[tuple[int, float]] = deque(maxlen=OFFSETS)
+        self.offsets = ZeroOffsets()  # measured - model
         # Setpoint and displacement of the model as a sensor with delay or lag reads them; None without these. Points of
         # a trajectory are output earlier by the delay of the stage.
         self._setpoint: Sensed | None = None
@@ -88,11 +83,6 @@ class Loop:
     def applied(self, stream: StreamingInverse) -> StreamingInverse:
         """Return the inverse that follows the total voltage: that of the axis, `stream`, before the first reading."""
         return self._applied if self.closed else stream
-
-    def offset(self, now_ns: int) -> float | None:
-        """Return the present measured - model displacement (m); None without a measurement in the last 0.2 s."""
-        recent = [offset for t, offset in self._offsets if now_ns - t <= OFFSET_AGE_NS]
-        return median(recent) if recent else None
 
     # Model and settings
 
@@ -187,16 +177,16 @@ class Loop:
 
     # Readings
 
-    def read(self, y: float, expected: float, now_ns: int, fresh: bool, within: bool) -> float:
+    def read(self, y: float, expected: float, now_ns: int, fresh: bool, within: bool, swing: int = 0) -> float:
         """Take a reading (m); return the displacement (m) without the sensor's own errors.
 
         `expected` (m) is where the model is. Only a `fresh` one, stamped now, counts for the zero, and only one
-        `within` the accepted displacements is corrected.
+        `within` the accepted displacements is corrected; `swing`: of a reset, with a known memory.
         """
         x = self._sensor.correct(y) if within else y
         sensed = self._expected.span(now_ns) if self._expected else ()
         if fresh and isfinite(x):
-            self._offsets.append((now_ns, x - (sensed[-1] if sensed else expected)))
+            self.offsets.take(x - (sensed[-1] if sensed else expected), swing, now_ns)
         return x
 
     def measure(self, x: float, expected: float, now_ns: int, watched: bool, tracking: TrackingStatistics) -> None:
@@ -235,10 +225,6 @@ class Loop:
         if self._held and not self.oscillation.held:
             self._feedback.forget()
         self._held = self.oscillation.held
-
-    def forget_offsets(self) -> None:
-        """Forget the offsets: the zero has moved."""
-        self._offsets.clear()
 
     # Voltages
 

@@ -51,6 +51,10 @@ DECLARATIONS = declare.read_only(
         "Voltages applied to all axes one day before the start, followed by 0 V, to reproduce an earlier state.",
         number=True,
     ),
+    declare.scalar(
+        "warm_up", 0.0, "Time for which the stage has been switched on at the start: its drifts are so old; seconds.",
+        (0.0, 1e7),
+    ),
     Declaration(
         "answer_commands", True, "Whether to publish one state for each command; else `rate` states per second."
     ),
@@ -118,7 +122,7 @@ class StageSimulator(Node):
         begun = self._now_ns() * 1e-9
         for v in (*history, rest):
             self._stage.step(begun - DAY, [v] * len(axes))
-        self._stage.begin_drift(begun)
+        self._stage.begin_drift(begun - values["warm_up"])
         self._apply([rest] * len(axes))
         self._publisher = self.create_publisher(JointState, "stage_state", COMMANDS)
         self._answers, self._commanded_at = values["answer_commands"], -math.inf

@@ -9,7 +9,16 @@ from calibration.stages import RATE, SimulatedRecorder, settings, stage_of
 from refusals import holds
 from strategies import FAMILY_CASE, axis_model
 
-from slpi_ros.calibration.run import Recording, aligned, calibrate, tracking_error, why, with_present_zero
+from slpi_ros.calibration.run import (
+    Recording,
+    aligned,
+    before_path,
+    calibrate,
+    moved_zeros,
+    tracking_error,
+    why,
+    with_present_zero,
+)
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.delay import Delay
 from slpi_ros.effects.thermal_drift import ThermalDrift
@@ -190,6 +199,21 @@ def test_the_zero_of_a_model_is_that_of_the_last_record():
     # The same motion, elsewhere.
     moved = axis.simulate(t, v) - model.axes["x"].simulate(t, v)
     np.testing.assert_allclose(moved, 0.3e-6, rtol=0, atol=1e-12)
+
+
+def test_the_zero_of_a_verification_is_that_of_the_sweep_before_its_path():
+    t = np.arange(4000) / 200.0
+    v = 50.0 - 50.0 * np.cos(t)
+    seen = MODEL.simulate(np.append(t, t + 20.0), {"x": np.append(v, v)})["x"]
+    stamps = np.round(t * 1e9).astype(np.int64)
+    before = Record(stamps, {"x": v}, {"x": seen[:4000]})
+    # The zero moves between the records, and again before the path, which is an error.
+    own = seen[4000:] + np.where(t < 10.0, 0.3e-6, 0.32e-6)
+    desired = np.where(t < 10.0, np.nan, seen[4000:])
+    recording = Recording(Record(stamps + 20 * 10**9, {"x": v}, {"x": own}), {"x": desired})
+    moved = moved_zeros(MODEL, [before, before_path(recording)])["x"]
+    assert moved == pytest.approx(0.3e-6, abs=1e-12)
+    assert tracking_error(recording, "x", MODEL, 1e-8, moved).mean == pytest.approx(0.02e-6, abs=1e-12)
 
 
 @pytest.mark.slow

@@ -137,6 +137,43 @@ def test_after_a_reset_the_zero_is_said_to_come_from_there():
     assert {(axis.zero.source, axis.zero.offset) for axis in bench.controller.axes} == {(RESET, 0.0)}
 
 
+def test_right_after_a_reset_the_zero_is_that_of_its_sweep():
+    bench = Bench(PLAIN)
+    bench.sample(0.2)
+    controller = bench.controller
+    controller.reset_memory(4, 1000.0, [0.0, 0.0], bench.now_ns)
+    while controller.mode is OperatingMode.RESETTING:
+        bench.now_ns += MS
+        controller.advance(bench.now_ns, bench.now_ns)
+        bench.read()
+    # What the stage does at the end of the sweep is not its zero; so it is once the axis has moved, or has long rested.
+    bench.moved = {name: moved + 100e-9 for name, moved in MOVED.items()}
+    for _ in range(100):
+        bench.now_ns += MS
+        bench.read()
+    sweep = {name: pytest.approx(moved, abs=20e-9) for name, moved in MOVED.items()}
+    assert {axis.name: axis.loop.offsets.present(bench.now_ns) for axis in controller.axes} == sweep
+    bench.now_ns += 61_000 * MS
+    bench.read()
+    present = {name: pytest.approx(moved + 100e-9, abs=20e-9) for name, moved in MOVED.items()}
+    assert {axis.name: axis.loop.offsets.present(bench.now_ns) for axis in controller.axes} == present
+    assert controller.set_zero(bench.now_ns) == present
+
+
+def test_a_setpoint_after_a_reset_ends_its_sweep():
+    bench = Bench(PLAIN)
+    bench.sample(0.2)
+    bench.controller.reset_memory(4, 1000.0, [0.0, 0.0], bench.now_ns)
+    while bench.controller.mode is OperatingMode.RESETTING:
+        bench.now_ns += MS
+        bench.controller.advance(bench.now_ns, bench.now_ns)
+        bench.read()
+    bench.moved = {name: moved + 100e-9 for name, moved in MOVED.items()}
+    bench.run(0.2, 0.3, 100)
+    moved = bench.controller.set_zero(bench.now_ns)
+    assert moved == {name: pytest.approx(moved + 100e-9, abs=20e-9) for name, moved in MOVED.items()}
+
+
 def test_creep_goes_on_over_a_restart(tmp_path):
     """The stage rests for some seconds while nobody compensates; a model that was at rest then was off by 23 nm."""
     bench = Bench(RICH, moved=dict.fromkeys(NAMES, 0.0))

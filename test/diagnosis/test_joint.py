@@ -93,10 +93,11 @@ def test_errors_of_a_record_left_out_are_those_of_a_hysteresis_fitted_to_the_oth
             *(without_hysteresis(joint, each, kept) for each in np.column_stack([y, columns]).T), strict=True
         )
         left, rough = np.column_stack(left), np.column_stack(rough)
-        # What the others hardly determine follows from the record itself, with little weight.
+        # What the others hardly determine follows from the record itself, with little weight, where they predict it.
         some = np.sqrt(UNDETERMINED)
-        everything = np.vstack([left[kept], rough, some * left[rows]])
-        constant = np.concatenate([np.zeros(np.count_nonzero(kept) + rough.shape[0]), np.full(1500, some)])
+        known = np.flatnonzero(~kept & joint.predictable)
+        everything = np.vstack([left[kept], rough, some * left[known]])
+        constant = np.concatenate([np.zeros(np.count_nonzero(kept) + rough.shape[0]), np.full(known.size, some)])
         gains = np.linalg.lstsq(np.column_stack([everything[:, 1:], constant]), everything[:, 0])[0][:-1]
         alone = [2] if own and record == 0 else []
         shared = [k for k in range(columns.shape[1]) if k not in alone]
@@ -104,10 +105,9 @@ def test_errors_of_a_record_left_out_are_those_of_a_hysteresis_fitted_to_the_oth
         beside = np.column_stack([left[:, 1:][:, alone], np.ones(y.size)])
         next(groups)
         for _ in range(FOLDS):
-            fold = next(groups)
-            fitted = np.setdiff1d(np.arange(rows.start, rows.stop), fold)
-            predicted = beside[fold] @ np.linalg.lstsq(beside[fitted], rest[fitted])[0]
-            errors[fold] = np.where(joint.predictable[fold], rest[fold] - predicted, np.nan)
+            fold = np.intersect1d(next(groups), known)
+            fitted = np.setdiff1d(known, fold)
+            errors[fold] = rest[fold] - beside[fold] @ np.linalg.lstsq(beside[fitted], rest[fitted])[0]
     loss = losses(joint, y, columns)
     np.testing.assert_allclose(loss.errors, errors[np.isfinite(errors)], atol=1e-3 * loss.rms)
     assert loss.errors.size >= 0.5 * y.size and np.isfinite(loss.records).all()

@@ -199,8 +199,7 @@ def _diagnose_axis(
 class _Extension(NamedTuple):
     """Refitted model, and its free run on each record.
 
-    `judged` are its free runs with the effects of each record, such as drift, and with what goes on from before it, by
-    which the causes are judged.
+    `judged` are its free runs with the effects of each record, such as drift, by which the causes are judged.
     """
 
     model: AxisModel
@@ -219,18 +218,16 @@ def _extension(model: AxisModel, answer: Answer, given: Given, source: str) -> _
 
 
 def _runs(model: AxisModel, now: Explanation, *, own: bool = False) -> list[FreeRun]:
-    """Return the free run of an extended model on each of its records, as the effects began there.
+    """Return the free run of an extended model on each of its records, with what goes on from before it.
 
-    With `own`, also with the effects of each record, such as drift, and with what goes on from before it.
+    With `own`, also with the effects of each record, such as drift.
     """
     separate: list[Any] = [effect for effect in now.effects if isinstance(effect, EachRecord)]
-    if own:
-        begun = [effect.started(np.zeros_like(now.began.get(effect.name, ())), 2) for effect in model.effects]
-        model = replace(model, effects=tuple(begun))
+    begun = [effect.started(np.zeros_like(now.began.get(effect.name, ())), 2) for effect in model.effects]
+    model = replace(model, effects=tuple(begun))
     runs = []
     for k, (part, rows) in enumerate(zip(now.evidence.parts, now.evidence.slices, strict=True)):
-        if own:
-            part = replace(part, y=part.y - now.settling[rows])
+        part = replace(part, y=part.y - now.settling[rows])
         added = [each.parts[k] for each in separate if own]
         # An error of the sensor goes with its reading, whose zero is not that of the model.
         for effect in added:

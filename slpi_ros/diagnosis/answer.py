@@ -57,12 +57,16 @@ class Answer:
     # Effects that were found, and make a record worse or another hysteresis unnecessary.
     dropped: tuple[str, ...] = ()
 
-    def without_last(self) -> "Answer":
-        """Return the answer without the effect that gains least."""
-        *named, last = self.named
-        now = self.now.without(last.name).refined(CONVERGED) if named else self.base
-        kept = tuple(replace(one, without=now.without(one.name).held_out) for one in named)
-        return replace(self, now=now, named=kept, dropped=tuple(sorted({*self.dropped, last.name})))
+    def without(self, name: str) -> "Answer":
+        """Return the answer without one of its effects."""
+        left = [one for one in self.named if one.name != name]
+        now, before, kept = self.now.without(name).refined(CONVERGED) if left else self.base, self.base.held_out, []
+        for place, one in enumerate(left):
+            taken = {effect.name for effect in self.base.effects} | {other.name for other in left[: place + 1]}
+            after = now.only(taken).held_out
+            kept.append(replace(one, before=before, after=after, without=now.without(one.name).held_out))
+            before = after
+        return replace(self, now=now, named=tuple(kept), dropped=tuple(sorted({*self.dropped, name})))
 
 
 class Judge:
@@ -82,7 +86,9 @@ class Judge:
                 break
             if not self._beats(best.held_out, fitted.loss):
                 fewer = self._rebuilt(fitted)
-                if not self._beats(best.held_out, fewer.held_out) and not self._senseless(fewer):
+                if self._beats(best.held_out, fewer.held_out) or self._senseless(fewer):
+                    continue
+                if all(self._beats(fewer.held_out, self._without(fewer, name).held_out) for name in self._free(fewer)):
                     now = fewer
                     break
         now, rivals = self._exchanged(self._needed(now, best))
@@ -109,7 +115,7 @@ class Judge:
 
     def _senseless(self, now: Explanation) -> dict[str, float]:
         """Return the effects that explain too little of what is there where they act, with that share."""
-        shares = {name: share(now.held_out, self._without(now, name).held_out, now.noise) for name in self._free(now)}
+        shares = {name: share(now.held_out, self._without(now, name).held_out, self._noise) for name in self._free(now)}
         if len(now.evidence.parts) == 1 and now.held_out.rms > ABOVE_NOISE * now.noise:
             # A free course of one record is refuted by nothing but what it leaves.
             shares |= {name: -1.0 for name in shares if now.effect(name).courses}
@@ -145,11 +151,12 @@ class Judge:
         return now, rivals
 
     def _in_its_place(self, now: Explanation, name: str) -> tuple[Explanation | None, tuple[Rival, ...]]:
-        """Return the joint fit with a better effect in the place of one, if there is any, and all rivals."""
+        """Return the joint fit with another effect, better or as good with fewer numbers, if any; all rivals."""
         rest, effect = self._without(now, name), now.effect(name)
         # One drive frequency does not tell effects apart that depend on time, and one record not a quantity from a
         # drift, however many numbers they have.
-        alone, unproved = one_speed(now.evidence), bool(effect.keys) and len(now.evidence.parts) == 1
+        alone, single = one_speed(now.evidence), len(now.evidence.parts) == 1
+        unproved = single and bool(effect.keys)
         library = Library(rest, self._search.names)
         present = {other.name for other in rest.effects} | (set() if effect.keys else {name})
         singles = library.screened((), (), present)
@@ -170,22 +177,17 @@ class Judge:
                 continue
             found.append((" ".join([form.name, *fit.effect(form.name).keys]), fit))
         found.sort(key=lambda pair: pair[1].held_out.square)
-        rivals, better = list[Rival](), None
+        rivals, better, own = list[Rival](), list[Explanation](), Fitted.of(now).numbers
         for label, fit in found:
-            as_good = not self._beats(now.held_out, fit.held_out)
-            fewer = Fitted.of(fit).numbers <= Fitted.of(now).numbers
-            if (
-                as_good
-                and unproved
-                and fit.effect(label.partition(" ")[0]).courses
-                or fewer
-                and fit.held_out.square < now.held_out.square
-            ):
-                better = better or fit
-            if fewer or alone:
+            as_good, numbers = not self._beats(now.held_out, fit.held_out), Fitted.of(fit).numbers
+            other = fit.effect(label.partition(" ")[0])
+            fewer = numbers < own or (numbers == own and fit.held_out.square < now.held_out.square)
+            if as_good and (unproved and other.courses or fewer and not (single and other.keys and effect.courses)):
+                better.append(fit)
+            if numbers <= own or alone:
                 as_good = as_good or (alone and self._beats(fit.held_out, rest.held_out))
                 rivals.append(Rival(label, fit.held_out, as_good))
-        return better, tuple(rivals)
+        return min(better, key=lambda fit: (Fitted.of(fit).numbers, fit.held_out.square), default=None), tuple(rivals)
 
     def _named(self, now: Explanation, rivals: dict[str, tuple[Rival, ...]]) -> tuple[Named, ...]:
         """Return the effects, each with its gain when added to the preceding ones, the largest gain first."""

@@ -13,8 +13,10 @@ from slpi_ros.diagnosis.held_out import Loss, in_blocks
 CHANCE = 0.001
 # A contribution below this share of the sensor's noise is not told.
 LEAST = 0.1
-# Least share, of the mean square that is there where an effect acts, that it explains.
+# Least share, of the mean square that is there as an effect predicts it, that it explains.
 EXPLAINED = 0.8
+# It acts in blocks with at least this share of the largest contribution.
+SMALLEST = 1e-6
 # Largest ratio of the errors on a record left out with a set that is better, and without.
 NO_WORSE = 1.05
 # Random signs of the blocks, and the share of them by which the number of independent sets is estimated.
@@ -37,11 +39,19 @@ def carries_over(one: Loss, other: Loss) -> bool:
 
 
 def share(one: Loss, without: Loss, noise: float) -> float:
-    """Return the share that an effect explains of what is there where it acts, beyond the noise (m)."""
-    # Weighted by what it predicts.
+    """Return the share that an effect explains of what is there as it predicts it, beyond the noise (m).
+
+    Block by block of the errors without it, the mean square along its contribution: what another cause leaves beside
+    it does not count, and what imitates another cause fits some blocks and not others.
+    """
     own, its = one.beside(without)
-    left, there = (float(np.sum((its - own) ** 2 * (errors**2 - noise**2))) for errors in (own, its))
-    return 1.0 - left / there if there > 0.0 else 0.0
+    d = its - own
+    size, left, there = in_blocks(d * d), in_blocks(d * own), in_blocks(d * its)
+    acts = size > SMALLEST * size.max(initial=0.0)
+    if not acts.any():
+        return 0.0
+    left_square, there_square = (float(np.sum(each[acts] ** 2 / size[acts] - noise**2)) for each in (left, there))
+    return 1.0 - left_square / there_square if there_square > 0.0 else 0.0
 
 
 def chance(one: Loss, other: Loss, trials: float = 1.0) -> float:
@@ -58,23 +68,27 @@ def _by_products(one: Loss, other: Loss) -> float:
     """
     e, without = one.beside(other)
     products, fall = in_blocks((without - e) * e), float(np.sum(without**2 - e**2))
-    return _p_value(fall, 2.0 * float(np.sqrt(np.sum(products**2))), products)
+    return _p_value(fall, 2.0 * float(np.sqrt(np.sum(products**2))), products.size, _in_a_row(products))
 
 
 def _by_shares(one: Loss, other: Loss) -> float:
-    """Return the p-value of the mean share by which the squares of a block fall, whatever their size."""
-    a, b = (in_blocks(errors**2) for errors in one.beside(other))
+    """Return the p-value of the mean share by which the squares of a block fall, whatever their size.
+
+    Blocks are independent that are longer than errors are alike.
+    """
+    errors = one.beside(other)
+    a, b = (in_blocks(each**2) for each in errors)
     shares = (b - a) / np.maximum(a + b, 1e-300)
     around = shares - shares.mean()
-    return _p_value(float(np.sum(shares)), float(np.sqrt(np.sum(around**2))), around)
+    row = max(alike_in_a_row(each) for each in errors) * shares.size / errors[0].size
+    return _p_value(float(np.sum(shares)), float(np.sqrt(np.sum(around**2))), shares.size, max(row, 1.0))
 
 
-def _p_value(gain: float, deviation: float, series: FloatArray) -> float:
-    """Return the one-sided p-value of a sum over blocks, for its deviation if the `series` had no correlation."""
-    row = _in_a_row(series)
+def _p_value(gain: float, deviation: float, count: int, row: float) -> float:
+    """Return the one-sided p-value of a sum over `count` blocks, of which `row` successive ones are alike."""
     if not deviation > 0.0:
         return LEAST_CHANCE if gain > 0.0 else 1.0
-    return float(stdtr(max(series.size / row - 1.0, 1.0), -gain / (deviation * np.sqrt(row))))
+    return float(stdtr(max(count / row - 1.0, 1.0), -gain / (deviation * np.sqrt(row))))
 
 
 def independent_trials(before: FloatArray, tried: Sequence[FloatArray]) -> float:

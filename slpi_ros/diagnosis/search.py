@@ -230,9 +230,9 @@ class Library:
             while beam:
                 grown: dict[tuple[str, ...], Choice] = {}
                 for choice in beam:
-                    if len(present) - len(removed) + len(choice.forms) >= MOST_EFFECTS + len(fixed):
-                        continue
-                    for form in self.screened(removed, choice.forms, once)[:screened]:
+                    names = ({*present} - removed) | {form.name for form in choice.forms}
+                    full = once | (EFFECTS.keys() - names if len(names) >= MOST_EFFECTS + len(fixed) else set())
+                    for form in self.screened(removed, choice.forms, full)[:screened]:
                         one = self.choice(removed, (*choice.forms, form))
                         if one.names not in grown or one.square < grown[one.names].square:
                             grown[one.names] = one

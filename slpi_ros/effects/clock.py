@@ -20,6 +20,8 @@ from slpi_ros.effects.parameters import Fit, Scales, parameter
 
 # Rate by which the fit's column is computed.
 STEP = 1e-6
+# Shortest record (s): crystals differ by 100 ppm at most, which is less than a millisecond within this time, as a delay.
+SHORTEST = 10.0
 
 
 def _draw(path: DrivePath, limits: DriveLimits) -> None:
@@ -72,6 +74,8 @@ class Clock(EffectBase):
     @classmethod
     def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
         """Yield the time derivative of the displacement, times the time from the record's start."""
+        if not float(np.ptp(context.t)) >= SHORTEST:
+            return
         seen = np.where(context.used, context.y - context.residual, context.h)
         column = (cls(STEP).apply(seen, context.around) - seen) / STEP
         yield Candidate(column[:, None], cls._of)

@@ -51,5 +51,5 @@ def test_two_records_predict_a_third(records):
     ((seconds, uncertainty),) = [shift(effect) for effect in extended.effects if effect.name in ("delay", "lag")]
     assert abs(seconds - 0.109e-3) <= 3.0 * uncertainty <= 0.08e-3
     of_plain, of_extended = (error(model, records["100hz"]) for model in (plain, diagnosis.extended))
-    assert of_extended <= 0.27 and of_extended < 0.5 * of_plain
+    assert of_extended <= 0.29 and of_extended < 0.5 * of_plain
     assert all(0.0 < outcome.left_out_rms < outcome.before_rms for outcome in found.records)

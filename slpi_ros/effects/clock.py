@@ -20,7 +20,7 @@ from slpi_ros.effects.parameters import Fit, Scales, parameter
 
 # Rate by which the fit's column is computed.
 STEP = 1e-6
-# Shortest record (s): crystals differ by 100 ppm at most, which is less than a millisecond within this time, as a delay.
+# Shortest record (s): crystals differ by at most 100 ppm, less than a millisecond within this time, as a delay.
 SHORTEST = 10.0
 
 

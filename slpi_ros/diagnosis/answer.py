@@ -115,10 +115,14 @@ class Judge:
 
     def _senseless(self, now: Explanation) -> dict[str, float]:
         """Return the effects that explain too little of what is there where they act, with that share."""
-        shares = {name: share(now.held_out, self._without(now, name).held_out, self._noise) for name in self._free(now)}
-        if len(now.evidence.parts) == 1 and now.held_out.rms > ABOVE_NOISE * now.noise:
-            # A free course of one record is refuted by nothing but what it leaves.
-            shares |= {name: -1.0 for name in shares if now.effect(name).courses}
+        rest = {name: self._without(now, name).held_out for name in self._free(now)}
+        shares = {name: share(now.held_out, without, self._noise) for name, without in rest.items()}
+        single, little = len(now.evidence.parts) == 1, ABOVE_NOISE * now.noise
+        for name in shares:
+            # A free course of one record is refuted by nothing but what it leaves, and of several records fits what
+            # the others have in common, too: there it has to be more than noise.
+            if now.effect(name).courses and (now.held_out.rms > little if single else rest[name].rms <= little):
+                shares[name] = -1.0
         return {name: found for name, found in shares.items() if found < EXPLAINED}
 
     def _meaningful(self, now: Explanation) -> Explanation:

@@ -54,7 +54,7 @@ class Answer:
     named: tuple[Named, ...] = ()
     # Defects of the hysteresis model: `BIAS`, or keys of `STRUCTURES`.
     structures: tuple[str, ...] = ()
-    # Effects that were found, and make a record worse or another hysteresis unnecessary.
+    # Effects that were found, and make a record worse, or are not needed beside another hysteresis.
     dropped: tuple[str, ...] = ()
 
     def without(self, name: str) -> "Answer":
@@ -75,6 +75,8 @@ class Judge:
     def __init__(self, search: Search) -> None:
         self._search, self._base = search, search.base
         self._evidence, self._noise = search.base.evidence, search.base.noise
+        # The last fit of which effects were left out, and the fits without each.
+        self._whole, self._rest = search.base, dict[str, Explanation]()
 
     def answer(self) -> Answer:
         """Return the answer."""
@@ -108,6 +110,13 @@ class Judge:
 
     def _without(self, now: Explanation, name: str) -> Explanation:
         """Return the best joint fit of the other effects."""
+        if now is not self._whole:
+            self._whole, self._rest = now, {}
+        if name not in self._rest:
+            self._rest[name] = self._best_without(now, name)
+        return self._rest[name]
+
+    def _best_without(self, now: Explanation, name: str) -> Explanation:
         fit = now.without(name).refined(CONVERGED)
         same = [one for one in self._search.pool.values() if one.names == Fitted.of(fit).names]
         known = min(same, key=lambda one: one.loss.square, default=None)

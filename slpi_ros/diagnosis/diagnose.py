@@ -178,9 +178,10 @@ def _diagnose_axis(
         if not found.named:
             extension = None
             break
-        tried = [found.without(one.name) for one in found.named]
-        runs_of = [_runs(_extended(model, each.now, source), each.now, own=True) for each in tried]
-        found = tried[min(range(len(tried)), key=lambda k: rms_of(runs_of[k]))]
+        found = min(
+            (found.without(one.name) for one in found.named),
+            key=lambda each: rms_of(_runs(_extended(model, each.now, source), each.now, own=True)),
+        )
         given = _given(model, runs, found)
         extension = _extension(model, found, given, source)
     # A hysteresis as smooth as beside the effects that were tried takes up less of what is left.

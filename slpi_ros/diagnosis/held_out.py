@@ -76,18 +76,15 @@ class Division:
 
     errors: FloatArray  # (n, K), of each column, the hysteresis fitted to the rest
     rest: FloatArray  # (K, K), products of the columns in the rest, the hysteresis eliminated
-    place: IntArray  # (n,), where the squares of the errors belong; -1: not judged
+    place: IntArray  # (n,), where the errors belong; -1: not judged
     fold: IntArray  # (n,), fold of each row within a record that is left out; 0: never left out
     own: Mask  # (K,), columns that belong to the record left out alone; none for blocks of records
 
     @cached_property
-    def _rows(self) -> list[tuple[IntArray, IntArray]]:
-        """Rows of each fold that are judged, and where their squares belong."""
-        found = []
-        for fold in range(1, int(self.fold.max(initial=0)) + 1):
-            rows = np.flatnonzero((self.fold == fold) & (self.place >= 0))
-            found.append((rows, self.place[rows]))
-        return found
+    def _judged(self) -> list[IntArray]:
+        """Rows of each fold that are judged."""
+        folds = range(1, int(self.fold.max(initial=0)) + 1)
+        return [np.flatnonzero((self.fold == fold) & (self.place >= 0)) for fold in folds]
 
     def left(self, target: Sequence[int], chosen: Sequence[int], positive: Collection[int]) -> FloatArray:
         """Return the errors, shape (n,), of the sum of the columns `target` after a fit of the columns `chosen`."""
@@ -104,9 +101,9 @@ class Division:
         own = np.append(self.own[list(chosen)], True)
         y = y - beside[:, ~own] @ gains[~own]
         beside = beside[:, own]
-        square, product, left = beside.T @ beside, beside.T @ y, np.empty(y.size)
-        left[:] = y - beside @ solved(square, product)
-        for rows, _ in self._rows:
+        square, product = beside.T @ beside, beside.T @ y
+        left = np.asarray(y - beside @ solved(square, product))
+        for rows in self._judged:
             part = beside[rows]
             left[rows] = y[rows] - part @ solved(square - part.T @ part, product - part.T @ y[rows])
         return left

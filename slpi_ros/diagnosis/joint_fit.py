@@ -72,8 +72,7 @@ class Joint:
             self.predictable = like.predictable
         self.problem, self.evidence, self.u = evidence.problem(u), evidence, u
         # The same samples are judged whatever voltage the effects let through.
-        groups: list[IntArray] = like._groups if like else _groups(evidence.problem(evidence.v), evidence)
-        self._groups: list[IntArray] = groups
+        self._groups: list[IntArray] = like._groups if like else _groups(evidence.problem(evidence.v), evidence)
         self.everything = self.problem.design.rows(np.concatenate(self._groups))
         self._ends = np.cumsum([0, *(rows.size for rows in self._groups)]).tolist()
         # Sample of each row of the problem, and of each fitted row in the order of the groups.
@@ -397,8 +396,8 @@ class Explanation:
         if not filters:
             return signal
         parts = []
-        for part, own in zip(self.evidence.parts, self.around.split(signal), strict=True):
-            around, own = EffectContext((part.t[-1] - part.t)[::-1]), own[::-1]
+        for around, own in zip(self.evidence.reversed, self.around.split(signal), strict=True):
+            own = own[::-1]
             for effect in reversed(filters):
                 own = effect.apply(own, around)
             parts.append(own[::-1])

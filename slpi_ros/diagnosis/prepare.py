@@ -165,6 +165,12 @@ class Evidence:
         )
 
     @cached_property
+    def reversed(self) -> tuple[EffectContext, ...]:
+        """Contexts of the records in reversed time."""
+        times = [(part.t[-1] - part.t)[::-1] for part in self.parts]
+        return tuple(EffectContext(t, grid=Uniform.over(t)) for t in times)
+
+    @cached_property
     def rounding(self) -> float:
         """Rms rounding error of the finest sensor resolution among the records, metres."""
         return float(min(part.digit for part in self.parts) / np.sqrt(12.0))

@@ -91,7 +91,11 @@ class Form:
     candidate: Candidate | Effect
     first: int
     end: int
-    numbers: int
+
+    @property
+    def numbers(self) -> int:
+        """How many columns it has."""
+        return self.end - self.first
 
     @property
     def places(self) -> range:
@@ -110,7 +114,7 @@ class Form:
         return range(self.end - count, self.end)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Choice:
     """Forms added to a joint fit, effects taken from it, and what would be left to first order."""
 
@@ -142,10 +146,9 @@ class Library:
         }
         sampled, forms, place = [now.joint.sampled(own)], [], own.shape[1]
         for name, candidate, columns in self._candidates(names or EFFECTS):
-            numbers = columns.shape[1]
-            forms.append(Form(name, candidate, place, place + numbers, numbers))
+            forms.append(Form(name, candidate, place, place + columns.shape[1]))
             sampled.append(now.joint.sampled(columns))
-            place += numbers
+            place += columns.shape[1]
         self.forms = forms
         at = np.column_stack(sampled)
         size = np.linalg.norm(at, axis=0)
@@ -166,19 +169,18 @@ class Library:
                 except ModelError:
                     continue
 
-    def base(self, removed: Collection[str]) -> tuple[list[int], list[int]]:
-        """Return the columns that add up to the target, and those of the effects that stay."""
-        kept = [self._own[name] for name in self._own if name not in removed]
+    def columns(self, removed: Collection[str], forms: Sequence[Form]) -> tuple[list[int], list[int], set[int]]:
+        """Return the columns that add up to the target, those that are fitted, and those of gains not negative."""
+        kept = [place for name, (_, places) in self._own.items() if name not in removed for place in places]
         target = [0, *(self._own[name][0] for name in removed)]
-        return target, [*self._beside, *(place for _, places in kept for place in places)]
+        chosen = [*self._beside, *kept, *(place for form in forms for place in form.places)]
+        return target, chosen, {place for form in forms for place in form.positive}
 
     def choice(self, removed: frozenset[str], forms: tuple[Form, ...]) -> Choice:
-        """Return a set with what is left to first order."""
+        """Return a set with what is left to first order, one and the same for the same set."""
         key = removed, frozenset(forms)
         if key not in self._known:
-            target, kept = self.base(removed)
-            chosen = [*kept, *(place for form in forms for place in form.places)]
-            loss = self.held_out.loss(target, chosen, {place for form in forms for place in form.positive})
+            loss = self.held_out.loss(*self.columns(removed, forms))
             self._known[key] = Choice(removed, forms, loss.square, loss.blocks)
         return self._known[key]
 
@@ -189,8 +191,7 @@ class Library:
 
     def screened(self, removed: Collection[str], taken: Sequence[Form], once: Collection[str]) -> list[Form]:
         """Return the forms that explain most of the fitted samples, the best of each group of each effect."""
-        target, kept = self.base(removed)
-        chosen = [*kept, *(place for form in taken for place in form.places)]
+        target, chosen, _ = self.columns(removed, taken)
         whole = self.held_out.whole
         vector = whole[:, target].sum(axis=1)
         if chosen:
@@ -212,7 +213,7 @@ class Library:
             gain = float(
                 wanted / size @ np.linalg.solve(own / np.outer(size, size) + 1e-6 * np.eye(len(places)), wanted / size)
             )
-            key = form.name, getattr(form.candidate, "group", 0), form.numbers
+            key = *form.kind, form.numbers
             if key not in best or gain > best[key][0]:
                 best[key] = gain, form
         return [form for _, form in sorted(best.values(), key=lambda pair: -pair[0])]
@@ -243,9 +244,7 @@ class Library:
 
     def fit(self, choice: Choice) -> Explanation | Form:
         """Return the joint fit with a choice at first parameters, or the form of it that is not admissible."""
-        target, kept = self.base(choice.removed)
-        chosen = [*kept, *(place for form in choice.forms for place in form.places)]
-        positive = {place for form in choice.forms for place in form.positive}
+        target, chosen, positive = self.columns(choice.removed, choice.forms)
         gains = self.held_out.gains(target, chosen, positive)
         at = dict(zip(chosen, (gains / self._size[chosen]).tolist(), strict=True))
         fit = self.now.only(
@@ -317,12 +316,12 @@ class Search:
         library, best = Library(now, self.names), now
         choices = library.choices(self.fixed)
         self.trials = max(self.trials, independent_trials(now.held_out.blocks, [one.blocks for one in choices]))
-        tried: set[tuple[frozenset[str], frozenset[Form]]] = set()
+        tried = set[Choice]()
         for _ in range(MOST_TRIED):
-            left = (one for one in _worth_fitting(choices, now) if (one.removed, frozenset(one.forms)) not in tried)
-            if (choice := next(left, None)) is None:
+            choice = next((one for one in _worth_fitting(choices, now) if one not in tried), None)
+            if choice is None:
                 break
-            tried.add((choice.removed, frozenset(choice.forms)))
+            tried.add(choice)
             first = library.fit(choice)
             if isinstance(first, Form):
                 library.forms.remove(first)

@@ -7,14 +7,7 @@ from typing import ClassVar
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import (
-    Candidate,
-    EffectBase,
-    EffectContext,
-    ResidualContext,
-    Side,
-    Signal,
-)
+from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, ResidualContext, Side, Signal
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, Scales, parameter
 

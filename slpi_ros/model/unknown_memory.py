@@ -7,6 +7,7 @@ that they had not in common, and once all are wiped out, the three agree.
 
 from dataclasses import replace
 from math import inf
+from typing import TypeVar
 
 import numpy as np
 
@@ -14,6 +15,8 @@ from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import EffectContext
 from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.model.axis_model import AxisModel, Start, StartMemory
+
+Scalars = TypeVar("Scalars", float, FloatArray)
 
 
 class UnknownMemory:
@@ -46,10 +49,7 @@ class UnknownMemory:
         u = np.clip(v, *self._clipped)
         if self._around:
             u = self._around.apply(u, EffectContext.since_start(t, start=self.start))
-        assumed, fallen, risen = (memory.forward_array(u) - zero for memory, zero in self._memories)
-        one, other = fallen - assumed, risen - assumed
-        # Rectangular between the two extreme memories, about the assumed one.
-        return np.asarray((one**2 + one * other + other**2) / 3.0)
+        return np.asarray(_square(*(memory.forward_array(u) - zero for memory, zero in self._memories)))
 
     def step(self, t: float, v: float) -> float:
         """Return it after the voltage `v` (V) at time `t` (s)."""
@@ -57,6 +57,10 @@ class UnknownMemory:
         if self._streaming:
             u = self._streaming.forward(max(t - self._t, 0.0), u)
             self._t = t
-        assumed, fallen, risen = (memory.forward(u) - zero for memory, zero in self._memories)
-        one, other = fallen - assumed, risen - assumed
-        return (one**2 + one * other + other**2) / 3.0
+        return _square(*(memory.forward(u) - zero for memory, zero in self._memories))
+
+
+def _square(assumed: Scalars, fallen: Scalars, risen: Scalars) -> Scalars:
+    """Return the mean square (m^2) about the assumed displacement (m), rectangular between the two extreme ones."""
+    one, other = fallen - assumed, risen - assumed
+    return (one**2 + one * other + other**2) / 3.0

@@ -127,13 +127,20 @@ def test_it_outlives_a_restart_but_not_another_model(tmp_path):
     assert {axis.zero.source for axis in other.axes} == {CALIBRATION}
 
 
-def test_after_a_reset_the_zero_is_said_to_come_from_there():
-    bench = Bench(PLAIN)
-    bench.sample(0.2)
-    bench.controller.reset_memory(2, 1000.0, [0.0, 0.0], bench.now_ns)
+def reset(bench, cycles, read=False):
+    """Reset the memory to the end; with `read` the displacement is read all the while."""
+    bench.controller.reset_memory(cycles, 1000.0, [0.0, 0.0], bench.now_ns)
     while bench.controller.mode is OperatingMode.RESETTING:
         bench.now_ns += MS
         bench.controller.advance(bench.now_ns, bench.now_ns)
+        if read:
+            bench.read()
+
+
+def test_after_a_reset_the_zero_is_said_to_come_from_there():
+    bench = Bench(PLAIN)
+    bench.sample(0.2)
+    reset(bench, 2)
     assert {(axis.zero.source, axis.zero.offset) for axis in bench.controller.axes} == {(RESET, 0.0)}
 
 
@@ -141,11 +148,7 @@ def test_right_after_a_reset_the_zero_is_that_of_its_sweep():
     bench = Bench(PLAIN)
     bench.sample(0.2)
     controller = bench.controller
-    controller.reset_memory(4, 1000.0, [0.0, 0.0], bench.now_ns)
-    while controller.mode is OperatingMode.RESETTING:
-        bench.now_ns += MS
-        controller.advance(bench.now_ns, bench.now_ns)
-        bench.read()
+    reset(bench, 4, read=True)
     # What the stage does at the end of the sweep is not its zero; so it is once the axis has moved, or has long rested.
     bench.moved = {name: moved + 100e-9 for name, moved in MOVED.items()}
     for _ in range(100):
@@ -163,11 +166,7 @@ def test_right_after_a_reset_the_zero_is_that_of_its_sweep():
 def test_a_setpoint_after_a_reset_ends_its_sweep():
     bench = Bench(PLAIN)
     bench.sample(0.2)
-    bench.controller.reset_memory(4, 1000.0, [0.0, 0.0], bench.now_ns)
-    while bench.controller.mode is OperatingMode.RESETTING:
-        bench.now_ns += MS
-        bench.controller.advance(bench.now_ns, bench.now_ns)
-        bench.read()
+    reset(bench, 4, read=True)
     bench.moved = {name: moved + 100e-9 for name, moved in MOVED.items()}
     bench.run(0.2, 0.3, 100)
     moved = bench.controller.set_zero(bench.now_ns)

@@ -1,5 +1,6 @@
 """Pages as they look: on dark paper, on a telephone, and printed."""
 
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -51,7 +52,8 @@ def browser(tmp_path_factory):
 def pages(tmp_path_factory):
     """Return the pages of ``verify``, ``tune`` and ``identify`` on the example, a diagnosis, and a calibration."""
     made = tmp_path_factory.mktemp("pages")
-    bag, model = EXAMPLES / "xy_stage", EXAMPLES / "xy_stage.json"
+    bag, model = made / LONG_NAME / "xy_stage", EXAMPLES / "xy_stage.json"
+    shutil.copytree(EXAMPLES / "xy_stage", bag)
     main(["verify", str(bag), "--model", str(model), "-o", str(made / "verify")])
     main(["tune", str(model), "-o", str(made / "gains.yaml"), "--report", str(made / "tune")])
     main(["identify", str(bag), "-o", str(made / "model.json"), "--report", str(made / "identify")])

@@ -73,9 +73,8 @@ class AxisLoop:
     @classmethod
     def of(cls, gains: PidGains, axis: AxisModel) -> "AxisLoop":
         """Return the loop of an axis."""
-        (low, high), (first, last) = axis.displacement_range, axis.voltage_range
-        slope = (high - low) / (last - first)
-        return cls(gains, axis.streaming_sensor(), slope, high - low, axis.quality.floor_rms)
+        low, high = axis.displacement_range
+        return cls(gains, axis.streaming_sensor(), axis.mean_slope, high - low, axis.quality.floor_rms)
 
 
 class ClosedLoop:
@@ -118,7 +117,7 @@ class _Corrected:
     def __init__(self, loop: AxisLoop, pace: RateLimiter, name: str) -> None:
         self._loop, self._feedback = loop, Feedback(loop.gains, pace)
         self._rule = OscillationRule(loop.span, loop.noise, name)
-        self._desired, self._held, self._checked_ns = nan, False, 0
+        self._desired, self._checked_ns = nan, 0
         self.off: Finding | None = None
 
     def measure(self, y: float, now_ns: int) -> None:
@@ -135,13 +134,10 @@ class _Corrected:
         rule.watch(on, now_ns)
         if on and now_ns - self._checked_ns >= CHECK_NS:
             self._checked_ns, self.off = now_ns, rule.check(now_ns)
-        if self._held and not rule.held:
-            feedback.forget()
-        self._held, on = rule.held, on and not self.off
+        on = on and not self.off
+        feedback.listen(rule.held)
         feedback.switch(on)
-        if not on:
-            return feedback.hold(now_ns, voltage)
-        return feedback.step(desired, voltage, now_ns, None if rule.held else TIMEOUT)
+        return feedback.step(desired, voltage, now_ns, TIMEOUT) if on else feedback.hold(now_ns, voltage)
 
 
 def too_slow(axis: AxisModel, gains: PidGains, period: float) -> bool:

@@ -72,7 +72,7 @@ class Feedback:
         self.correction_limit = correction_limit  # V, in each direction
         # Added to the feedforward voltage, V, after clipping to its limit and the voltage limits.
         self.correction = 0.0
-        self._taking_over = False
+        self._held = self._taking_over = False
         self._integral = self._offset = 0.0
         self._measured = self._error = self._rate = 0.0
         # Of the last sample, of the last measurement that was used, and of the last one that came.
@@ -94,6 +94,12 @@ class Feedback:
         self._error = self._rate = 0.0
         self._measured_ns = -inf
         self._taking_over = self.enabled
+
+    def listen(self, held: bool) -> None:
+        """Hold the correction while it is to be `held`, and go on without a voltage step after that."""
+        if self._held and not held:
+            self.forget()
+        self._held = held
 
     def retune(self, gains: PidGains) -> None:
         """Replace the gains without a voltage step, or raise and keep them if they give no finite voltage."""
@@ -172,10 +178,10 @@ class Feedback:
     def step(self, desired: float, feedforward: float, now_ns: int, timeout: float | None) -> float:
         """Return the voltage (V), corrected by the last measurement unless it is used or older than `timeout` (s).
 
-        None: with the present correction, as it is not time for another one.
+        None, or while it is held: with the present correction.
         """
         self._desired = desired
-        if timeout is None:
+        if timeout is None or self._held:
             return self.hold(now_ns, feedforward)
         latest, self._latest = self._latest, None
         # Between two measurements the correction is held.

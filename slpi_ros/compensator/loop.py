@@ -45,7 +45,6 @@ class Loop:
         self.fault: Finding | None = None  # for which the feedback is off
         self.sensor = SensorRule(1.0, axis=axis)  # whether its readings follow the model
         self.oscillation = OscillationRule(1.0, axis=axis)  # whether feedback sustains one
-        self._held = False  # whether the correction is held, to listen to it
         # Why gains are not used with the model at an output period (s); "": they are.
         self._refusal: Callable[[PidGains, float], str] = lambda gains, period: ""
         self.offsets = ZeroOffsets()  # measured - model
@@ -222,9 +221,8 @@ class Loop:
 
     def listen(self) -> None:
         """Hold the correction while the rule of oscillations listens, and go on without a voltage step."""
-        if self._held and not self.oscillation.held:
-            self._feedback.forget()
-        self._held = self.oscillation.held
+        if self.closed:
+            self._feedback.listen(self.oscillation.held)
 
     # Voltages
 
@@ -248,7 +246,7 @@ class Loop:
         if dt > MAX_DT:
             applied.wait(dt - MAX_DT)
             dt = MAX_DT
-        v = self._feedback.step(y, v, now_ns, self.settings.timeout if first and not self._held else None)
+        v = self._feedback.step(y, v, now_ns, self.settings.timeout if first else None)
         self.driven_ns = now_ns
         # At the end of the period after this one; a voltage that moves within an acceleration limit goes on in each.
         self.due_ns = self._corrected_ns + 2 * period_ns

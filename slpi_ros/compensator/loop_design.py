@@ -69,7 +69,7 @@ class Loop:
         if not model.causal:
             raise ModelError(f"kind {model.kind} needs the path in advance, feedback does not; identify another kind")
         steepest = Plant.of(model)
-        largest = replace(steepest, slope=_mean_slope(model, steepest.slope))
+        largest = replace(steepest, slope=min(model.mean_slope, steepest.slope))
         nominal = replace(steepest, slope=min(_small_slope(model), largest.slope))
         if not (isfinite(nominal.slope) and nominal.slope > 0.0):
             raise ModelError(f"the model has a slope of {nominal.slope:g} m/V; identify it from a record that moves")
@@ -277,12 +277,6 @@ def _smallest(back: ComplexArray, size: FloatArray, margin: float) -> float:
     if not meets.any():
         return inf
     return float(np.min((-back.real[meets] - np.sqrt(inside[meets])) / size[meets]))
-
-
-def _mean_slope(model: AxisModel, steepest: float) -> float:
-    """Return the slope (m/V) of the largest loop from end to end."""
-    (low, high), (first, last) = model.displacement_range, model.hysteresis_range
-    return min((high - low) / (last - first), steepest) if last > first else steepest
 
 
 def _small_slope(model: AxisModel) -> float:

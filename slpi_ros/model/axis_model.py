@@ -433,6 +433,12 @@ class AxisModel:
         (low, high), (lowest, highest) = self.voltage_range, self.chain.clipped
         return max(low, lowest), min(high, highest)
 
+    @property
+    def mean_slope(self) -> float:
+        """Slope (m/V) of the largest loop from end to end; infinite without a voltage range."""
+        (low, high), (first, last) = self.displacement_range, self.hysteresis_range
+        return (high - low) / (last - first) if last > first else inf
+
     @cached_property
     def felt_range(self) -> tuple[float, float]:
         """Voltage range (V) that the hysteresis has felt: an effect around it may have kept it from the limits."""

@@ -1,5 +1,7 @@
 """The exported C inverse beside the stream of Python: agreement, time and memory of a step, float, a full stack.
 
+Of the exported feedback what a step takes with each notch more.
+
     make bench-export                                            # 1e6 steps of 200 models, a few minutes
     .venv/bin/python benchmarks/export.py --steps 10000000       # 1e7 steps
 
@@ -22,6 +24,9 @@ from pathlib import Path
 
 import numpy as np
 
+from slpi_ros.compensator.feedback import PidGains
+from slpi_ros.compensator.gains_file import TunedGains
+from slpi_ros.compensator.loop_filter import Notch
 from slpi_ros.effects.contact import Contact
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.cross_coupling import CrossCoupling
@@ -61,6 +66,16 @@ void slpi_run(slpi_inverse_t *inverse, int n, const slpi_real *dt, const slpi_re
         code[k] = slpi_inverse_step(inverse, dt[k], y + k * SLPI_AXES, v + k * SLPI_AXES);
     }
 }
+#ifdef SLPI_FEEDBACK_DT
+void slpi_feed(int n, const slpi_real *y, slpi_real *v)
+{
+    slpi_feedback_t feedback;
+    slpi_feedback_init(&feedback);
+    for (int k = 0; k < n; k++) {
+        slpi_feedback_step(&feedback, SLPI_FEEDBACK_DT, y + k, y + n + k, v + k);
+    }
+}
+#endif
 """
 # The last step closes every loop of a full stack, after a pause, with a new step.
 WORST = """
@@ -300,6 +315,30 @@ def durations(folder, rng, steps=200_000, models=9):
         print(f"{label}: {mine * 1e9:.0f} ns a step (median), Python {its * 1e6:.1f} us: {ratio:.0f} times as fast")
 
 
+def notches(folder, rng, steps=1_000_000, most=4):
+    """Print the time of a step of the feedback of one axis without notches, and what each one more takes."""
+    y, times = 1e-6 * rng.standard_normal((2, steps)), []
+    v, plain = np.empty(steps), stage(rng, "pi", [])
+    compiled = []
+    for count in range(most + 1):
+        each = tuple(Notch(100.0 * (k + 1), 0.05, 1.0) for k in range(count))
+        gains = PidGains(1e5, 1e7, measurement_filter=1e-4, notches=each)
+        own = folder / f"notches{count}"
+        own.mkdir()
+        compiled.append(Compiled(own, plain.with_feedback(TunedGains(10_000.0, {"x": gains}))).library)
+    # In turn, so that all see the same moments of the computer.
+    for _ in range(15):
+        times.append([])
+        for library in compiled:
+            started = time.process_time()
+            library.slpi_feed(steps, *(each.ctypes.data_as(ctypes.c_void_p) for each in (y, v)))
+            times[-1].append((time.process_time() - started) / steps * 1e9)
+    least = np.min(times, axis=0)
+    more = float(np.polyfit(np.arange(most + 1), least, 1)[0])
+    print(f"feedback, low pass and 0 to {most} notches: {', '.join(f'{ns:.1f}' for ns in least)} ns a step; "
+          f"a notch {more:.1f} ns")  # fmt: skip
+
+
 def beyond(folder, rng):
     """Print the error by loops that were forgotten: nested loops, more than the stack holds."""
     one = stage(rng, "slpi", [])
@@ -351,13 +390,14 @@ def main():
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--steps", type=int, default=1_000_000, help="steps of all models; default: 1e6")
     parser.add_argument("--models", type=int, default=200)
-    parser.add_argument("--only", choices=("times", "worst", "stack", "agreement"), help="one part; default: all")
+    parts = ("times", "notches", "worst", "stack", "agreement")
+    parser.add_argument("--only", choices=parts, help="one part; default: all")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args()
     rng = np.random.default_rng(options.seed)
     with tempfile.TemporaryDirectory() as folder:
         parts = {
-            "times": durations, "worst": worst, "stack": beyond,
+            "times": durations, "notches": notches, "worst": worst, "stack": beyond,
             "agreement": partial(agreement, options.models, options.steps),
         }  # fmt: skip
         for name, part in parts.items():

@@ -13,7 +13,7 @@ from slpi_ros.compensator.loop_design import Design
 from slpi_ros.compensator.loop_margin import refusal
 from slpi_ros.compensator.monitor import Finding
 from slpi_ros.compensator.oscillation_rule import OscillationRule
-from slpi_ros.diagnosis.step_answers import StepAnswer
+from slpi_ros.diagnosis.step_answers import HELD, StepAnswer
 from slpi_ros.errors import UsageError
 from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.limits import Limits, RateLimiter
@@ -51,13 +51,20 @@ def showing(settings: CalibrationSettings, model: StageModel) -> dict[str, Float
         fastest = SLEW_USED * min(limits.slew, limits.mean_rate) / (axis.voltage_range[1] - axis.voltage_range[0])
         period = max(PERIOD, 2.0 * RASTER / fastest)
         phase = np.arange(round(PERIODS * period * settings.rate)) / (period * settings.rate) % 1.0
-        raster = RASTER * (0.5 - np.abs(phase - 0.5))
+        raster = RASTER * (1.0 - np.abs(2.0 * phase - 1.0))
         parts[name] = 0.5 * (low + high) + span * np.concatenate([np.repeat(sizes, held), raster])
     counts = [part.size for part in parts.values()]
     return {
         name: np.pad(part, (sum(counts[:k]), sum(counts[k + 1 :])), mode="edge")
         for k, (name, part) in enumerate(parts.items())
     }
+
+
+def moving(desired: FloatArray) -> slice:
+    """Return where desired displacements (m), (N,), as read from the stage, move on for longest: in the raster."""
+    changed = np.flatnonzero(np.diff(desired))
+    longest = max(np.split(changed, np.flatnonzero(np.diff(changed) >= HELD) + 1), key=len)
+    return slice(int(longest[0]), int(longest[-1]) + 2)
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.calibration.choice import next_drive
-from slpi_ros.calibration.closed_loop import AxisLoop, LoopResult, loops_of, showing, too_slow
+from slpi_ros.calibration.closed_loop import RASTER, AxisLoop, LoopResult, loops_of, moving, showing, too_slow
 from slpi_ros.calibration.drives import SWEEP_SECONDS, checking, compensated, driven_so_far, exciting
 from slpi_ros.calibration.kept import FOLLOWS, naming, require_kept
 from slpi_ros.calibration.settings import CALIBRATION, CalibrationSettings
@@ -78,6 +78,17 @@ class TrackingError:
     t: FloatArray  # s, from the first stamp of the record
     desired: FloatArray
     error: FloatArray
+
+    @classmethod
+    def of(cls, t: FloatArray, desired: FloatArray, error: FloatArray, stroke: float, goal: float) -> "TrackingError":
+        """Return the error along a path, shape (N,) each."""
+        offset, size = float(np.median(error)), np.abs(error)
+        rms, rest = float(np.sqrt(np.mean(error**2))), float(np.abs(error - offset).mean())
+        return cls(float(size.mean()), rms, float(size.max()), offset, rest, stroke, goal, t, desired, error)
+
+    def part(self, part: slice) -> "TrackingError":
+        """Return that of a part of the path."""
+        return TrackingError.of(self.t[part], self.desired[part], self.error[part], self.stroke, self.goal)
 
     @property
     def met(self) -> bool:
@@ -353,8 +364,10 @@ class _Calibration:
                     found[name] = replace(one, told=told)
                     continue
                 steps = step_answers(error.t, error.desired, error.error, model.axis(name).quality.floor_rms)
+                raster = error.part(moving(error.desired)).told()
                 off = f"; feedback was switched off: {recording.off}" if recording.off else ""
-                found[name] = replace(one, told=f"{one.told}; on the stage {error.told()}{off}", steps=steps)
+                told = f"{one.told}; on the stage a raster of {RASTER:.0%} of the stroke has a {raster}{off}"
+                found[name] = replace(one, told=told, steps=steps)
             self._records.append(recording.record)
         finding = "; ".join(f"axis {name}: {one.told}" for name, one in found.items())
         name, seconds = (self._records[-1].source, float(drive.t[-1])) if shown else ("tune", 0.0)
@@ -462,21 +475,8 @@ def tracking_error(recording: Recording, axis: str, model: StageModel, goal: flo
     along = np.isfinite(error)
     if not along.any():
         raise RecordError(f"{record.source}: axis '{axis}': no readings along the path; check stage_state")
-    error = error[along]
-    offset = float(np.median(error))
     low, high = model.axis(axis).displacement_range
-    return TrackingError(
-        mean=float(np.abs(error).mean()),
-        rms=float(np.sqrt(np.mean(error**2))),
-        maximum=float(np.abs(error).max()),
-        offset=offset,
-        rest=float(np.abs(error - offset).mean()),
-        stroke=high - low,
-        goal=goal,
-        t=record.t[along],
-        desired=desired[along],
-        error=error,
-    )
+    return TrackingError.of(record.t[along], desired[along], error[along], high - low, goal)
 
 
 def aligned(

@@ -50,7 +50,7 @@ def _run(options: Namespace) -> Result:
     with output_folder(options.report, *FILES) if options.report else nullcontext() as folder:
         gains = {name: found[name].gains if name in found else PidGains(0.0) for name in model.axes}
         stage = f" for stage {model.hardware_id}" if model.hardware_id else ""
-        TunedGains(options.rate, gains).write(options.output, stage)
+        TunedGains(options.rate, gains).write(options.output, f"slpi tune{stage}")
         if folder:
             write_files(folder, model, found, done.responses)
     lines = [

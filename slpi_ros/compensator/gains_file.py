@@ -1,4 +1,4 @@
-"""Gains of the feedback as a parameter file of the compensator: written by ``slpi tune``, read by ``slpi export``."""
+"""Gains of the feedback as a parameter file of the compensator, of ``slpi tune`` and of the calibrator."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -30,10 +30,10 @@ class TunedGains:
     rate: float
     axes: Mapping[str, PidGains]
 
-    def write(self, path: str, remark: str = "") -> None:
-        """Write a parameter file; SlpiError if it cannot be written. `remark` continues its first line."""
+    def write(self, path: str, by: str = "slpi tune") -> None:
+        """Write a parameter file, of which the first line says `by` what; SlpiError if it cannot be written."""
         names, gains = list(self.axes), list(self.axes.values())
-        lines = [f"{GAINS_MARK}{remark}"]
+        lines = [f"{GAINS_MARK}{by}"]
         if len(names) > 1:
             lines.append(f"# Several values are in the order of the axes {', '.join(names)}.")
         lines += ["/**:", "  ros__parameters:", f"    output_rate: {_number(self.rate)}"]

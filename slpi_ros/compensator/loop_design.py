@@ -30,6 +30,8 @@ MEASURED_OFF = (1.0 - DETUNING, 1.0 - DETUNING / 2.0, 1.0, 1.0 + DETUNING / 2.0,
 STEPS, COMBINED = 9, 3
 # The lowest frequency over the slowest rate of the loop, and the number of frequencies.
 LOWEST, FREQUENCIES = 1e-3, 300
+# Width of a notch that inverts its mode.
+WIDE = 5.0
 # A low pass may cost this share of the bandwidth for less noise.
 FOR_NOISE = 0.03
 # Bounds of damping and width of a notch, and of its frequency over that of the mode.
@@ -388,6 +390,13 @@ def _starts(loop: Loop) -> list[list[float]]:
         for least, width in ((0.0, 1.0), (DETUNING, 1.0), (2.0 * DETUNING, 5.0)):
             notches = [(0.0, log(max(mode.damping, least)), log(width)) for mode in loop.modes]
             found.append([lead, low_pass, *(v for each in notches for v in each)])
+    # A notch so wide that a proportional part cancels its slow pole: what is left inverts the mode.
+    for k, wide in enumerate(loop.modes):
+        for least in (DETUNING, 2.0 * DETUNING, 4.0 * DETUNING):
+            notches = [
+                (0.0, log(max(mode.damping, least)), log(WIDE if j == k else 1.0)) for j, mode in enumerate(loop.modes)
+            ]
+            found.append([log(2.0 * WIDE / wide.omega), none, *(v for each in notches for v in each)])
     return found
 
 

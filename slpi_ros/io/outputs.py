@@ -16,7 +16,7 @@ _Path = str | os.PathLike[str]
 # First element of every page, by which it is known as one of slpi's.
 PAGE_MARK = '<meta name="generator" content="slpi_ros">'
 # First words of every file of gains.
-GAINS_MARK = "# Gains of a compensator, by slpi tune"
+GAINS_MARK = "# Gains of a compensator, by "
 # Bytes at both ends of a file that tell what it is: a document and a page at its beginning, a table of results at its
 # end; the longest header of a table is shorter, too.
 _ENDS = 64 * 1024

@@ -27,7 +27,7 @@ def write_files(folder: Path, outcome: Outcome) -> None:
     diagnosis_files.write_files(folder / DIAGNOSIS, outcome.diagnosis)
     if any(one.design for one in outcome.loops.values()):
         stage = f" for stage {outcome.model.hardware_id}" if outcome.model.hardware_id else ""
-        TunedGains(outcome.settings.rate, gains_of(outcome.loops)).write(str(folder / GAINS), stage)
+        TunedGains(outcome.settings.rate, gains_of(outcome.loops)).write(str(folder / GAINS), f"the calibrator{stage}")
     page_of(outcome).write(folder / PAGE)
 
 

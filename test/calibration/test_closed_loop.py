@@ -9,7 +9,7 @@ import pytest
 from calibration.stages import SimulatedRecorder, settings, stage_of
 from strategies import PI_CASE, axis_model
 
-from slpi_ros.calibration.closed_loop import STEPS, AxisLoop, ClosedLoop, showing, too_slow
+from slpi_ros.calibration.closed_loop import RASTER, STEPS, AxisLoop, ClosedLoop, moving, showing, too_slow
 from slpi_ros.calibration.run import calibrate
 from slpi_ros.compensator.feedback import PidGains
 from slpi_ros.compensator.gains_file import TunedGains
@@ -29,13 +29,18 @@ RATE, SLOPE = 200.0, 2e-7
 def test_each_axis_shows_its_steps_while_the_others_rest():
     model = StageModel({"x": axis_model(PI_CASE), "y": axis_model(PI_CASE)})
     paths = showing(settings("xy"), model)
-    moving = {name: np.flatnonzero(np.diff(path)) for name, path in paths.items()}
-    assert moving["x"][-1] < moving["y"][0] and paths["x"].size == paths["y"].size
+    moves = {name: np.flatnonzero(np.diff(path)) for name, path in paths.items()}
+    assert moves["x"][-1] < moves["y"][0] and paths["x"].size == paths["y"].size
     low, high = model.axis("x").displacement_range
     for path in paths.values():
         assert low <= path.min() and path.max() <= high
         found = step_answers(np.arange(path.size) / RATE, path, np.zeros(path.size), 0.0)
         assert [each.size for each in found] == pytest.approx([size * (high - low) for size in STEPS])
+        # The raster is what moves on, also where the record was read between two setpoints.
+        read = np.interp(np.arange(2 * path.size) / 2.0, np.arange(path.size), path)
+        raster = read[moving(read)]
+        assert np.ptp(raster) == pytest.approx(RASTER * (high - low), rel=0.02)
+        assert np.all(np.diff(raster) != 0.0) and raster.size == pytest.approx(4 * RATE, abs=8)
 
 
 def test_readings_correct_the_drive_along_its_path_only():

@@ -31,11 +31,11 @@ STEPS, COMBINED = 9, 3
 # The lowest frequency over the slowest rate of the loop, and the number of frequencies.
 LOWEST, FREQUENCIES = 1e-3, 300
 # Width of a notch that inverts its mode.
-WIDE = 5.0
+WIDE = 10.0
 # A low pass may cost this share of the bandwidth for less noise.
 FOR_NOISE = 0.03
 # Bounds of damping and width of a notch, and of its frequency over that of the mode.
-DAMPINGS, WIDTHS, BESIDE_MODE = (1e-4, 3.0), (0.03, 10.0), (0.75, 1.33)
+DAMPINGS, WIDTHS, BESIDE_MODE = (1e-4, 3.0), (0.03, 30.0), (0.75, 1.33)
 # A time of a controller that is none, in periods; population for each number, at most, and generations of the search.
 NONE, POPULATION, MOST_TRIED, GENERATIONS = 0.01, 10, 60, 60
 # |S| at the bandwidth: -3 dB.
@@ -376,7 +376,7 @@ def _best(loop: Loop, margin: float, quick: bool = False) -> Shape:
         tol=1e-4, seed=0, polish=False,
     )  # fmt: skip
     last = {"maxfev": (30 if quick else 60) * size, "xatol": 1e-3, "fatol": 1e-4}
-    done = minimize(loss, found.x, (loop.hardest if quick else loop,), method="Nelder-Mead", options=last)
+    done = minimize(loss, found.x, (loop,), method="Nelder-Mead", options=last)
     return shape(done.x)
 
 
@@ -391,12 +391,11 @@ def _starts(loop: Loop) -> list[list[float]]:
             notches = [(0.0, log(max(mode.damping, least)), log(width)) for mode in loop.modes]
             found.append([lead, low_pass, *(v for each in notches for v in each)])
     # A notch so wide that a proportional part cancels its slow pole: what is left inverts the mode.
-    for k, wide in enumerate(loop.modes):
-        for least in (DETUNING, 2.0 * DETUNING, 4.0 * DETUNING):
-            notches = [
-                (0.0, log(max(mode.damping, least)), log(WIDE if j == k else 1.0)) for j, mode in enumerate(loop.modes)
-            ]
-            found.append([log(2.0 * WIDE / wide.omega), none, *(v for each in notches for v in each)])
+    for (k, wide), least in product(enumerate(loop.modes), (DETUNING, 2.0 * DETUNING, 4.0 * DETUNING)):
+        notches = [
+            (0.0, log(max(mode.damping, least)), log(WIDE if j == k else 1.0)) for j, mode in enumerate(loop.modes)
+        ]
+        found.append([log(2.0 * WIDE / wide.omega), none, *(v for each in notches for v in each)])
     return found
 
 

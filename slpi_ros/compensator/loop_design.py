@@ -7,6 +7,7 @@ from itertools import product
 from math import ceil, inf, isfinite, log, pi
 
 import numpy as np
+from numpy.typing import NDArray
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.compensator.feedback import PidGains
@@ -22,6 +23,9 @@ MARGIN, MARGINS, DETUNING = 0.5, (0.3, 0.9), 0.1
 MESSAGES = 3e-4
 # The margin is kept where the slope is larger by this share than that of the largest loop.
 STEEPER = 0.05
+# Above this ratio of the highest mode no record tells modes from lags and delays: the response may be that of the
+# model times the second number, with any phase.
+KNOWN, UNKNOWN = 2.0, 2.0
 # So many standard uncertainties less damping.
 UNCERTAIN = 2.0
 # Scales of the frequencies of a measured response.
@@ -40,6 +44,8 @@ DAMPINGS, WIDTHS, BESIDE_MODE = (1e-4, 3.0), (0.03, 30.0), (0.75, 1.33)
 NONE, POPULATION, MOST_TRIED, GENERATIONS = 0.01, 10, 60, 60
 # |S| at the bandwidth: -3 dB.
 HALF = 0.5**0.5
+# Sensitivities at which a loop is held against an integrator.
+LEVELS = (HALF, 0.5, 0.1)
 # Longest step, in periods, and in times of the bandwidth; what counts as settled; size of the step over the stroke.
 LONGEST_STEP, STEP_TIMES, SETTLED, STEP = 20_000, 12.0, 0.01, 0.1
 # Standard deviations of the noise within which a step has settled to the noise.
@@ -118,6 +124,12 @@ class Loop:
         return np.array(rows)
 
     @cached_property
+    def unknown(self) -> NDArray[np.bool_]:
+        """Which frequencies, shape (N,), are above `KNOWN` times all modes, and above what was measured."""
+        known = [KNOWN * mode.omega for mode in self.modes] + ([float(self.measured[0][-1])] if self.measured else [])
+        return np.asarray(self.omega > max(known, default=inf))
+
+    @cached_property
     def z(self) -> ComplexArray:
         """``exp(i w period)``, shape (N,)."""
         return np.asarray(np.exp(1j * self.omega * self.period))
@@ -131,11 +143,15 @@ class Loop:
     def largest(self, shape: "Shape", margin: float) -> float:
         """Return the largest integral gain up to which every smaller one keeps the margins at all corners, V/(m s).
 
-        `margin` is kept at the slope of the largest loop, `LEAST_MARGIN` at the steepest slope.
+        `margin` is kept at the slope of the largest loop, `LEAST_MARGIN` at the steepest slope, and where nothing is
+        known of the stage whatever its phase.
         """
         back = self.delayed * self.controller(shape)
         size = back.real**2 + back.imag**2
-        allowed = _smallest(back, size, margin), _smallest(back, size, LEAST_MARGIN) / self.steep
+        allowed = [_smallest(back, size, margin), _smallest(back, size, LEAST_MARGIN) / self.steep]
+        if self.unknown.any():
+            loudest = UNKNOWN * float(np.max(size[:, self.unknown])) ** 0.5
+            allowed.append((1.0 - LEAST_MARGIN) / max(loudest, 1e-300))
         return min(allowed) if min(allowed) < inf else 0.0
 
     def bandwidth(self, shape: "Shape", integral: float) -> float:
@@ -144,10 +160,11 @@ class Loop:
 
     def speed(self, shape: "Shape", integral: float) -> float:
         """Return the bandwidth (Hz), or that of the integrator whose sensitivity is as large further below."""
-        # Else a proportional gain alone had the largest bandwidth, and an error that stays.
+        # Else a proportional gain alone had the largest bandwidth, and an error that stays; or a sensitivity hardly
+        # below -3 dB over a wide band, which is above it where the stage is a little different.
         returned = self._returned(shape, integral)
         slow = integral * self.nominal.slope / (2.0 * pi)
-        return min(self._reached(returned, HALF), 10.0 * self._reached(returned, 0.1), slow)
+        return min(slow, *(self._reached(returned, level) * (level**-2 - 1.0) ** 0.5 for level in LEVELS))
 
     def _returned(self, shape: "Shape", integral: float) -> FloatArray:
         return np.asarray(np.abs(1.0 + integral * self.delayed[0] * self.controller(shape)))

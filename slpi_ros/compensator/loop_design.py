@@ -4,7 +4,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cached_property
 from itertools import product
-from math import ceil, inf, isfinite, log, pi
+from math import ceil, inf, isfinite, log, pi, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,7 +164,7 @@ class Loop:
         # below -3 dB over a wide band, which is above it where the stage is a little different.
         returned = self._returned(shape, integral)
         slow = integral * self.nominal.slope / (2.0 * pi)
-        return min(slow, *(self._reached(returned, level) * (level**-2 - 1.0) ** 0.5 for level in LEVELS))
+        return min(slow, *(self._reached(returned, level) * sqrt(level**-2 - 1.0) for level in LEVELS))
 
     def _returned(self, shape: "Shape", integral: float) -> FloatArray:
         return np.asarray(np.abs(1.0 + integral * self.delayed[0] * self.controller(shape)))
@@ -386,34 +386,43 @@ def _best(loop: Loop, margin: float, quick: bool = False) -> Shape:
         return -log(found) if found > 0.0 else 1e3
 
     size = len(bounds)
-    starts = np.array(_starts(loop)).clip(lowest, largest)
-    others = np.random.default_rng(0).uniform(lowest, largest, (min(POPULATION * size, MOST_TRIED), size))
-    found = differential_evolution(
-        loss, bounds, (loop.hardest,), init=np.vstack([starts, others]), maxiter=GENERATIONS // (2 if quick else 1),
-        tol=1e-4, seed=0, polish=False,
-    )  # fmt: skip
     last = {"maxfev": (30 if quick else 60) * size, "xatol": 1e-3, "fatol": 1e-4}
-    done = minimize(loss, found.x, (loop,), method="Nelder-Mead", options=last)
-    return shape(done.x)
+
+    def searched(seed: int, starts: list[list[float]]) -> tuple[float, FloatArray]:
+        others = np.random.default_rng(seed).uniform(lowest, largest, (min(POPULATION * size, MOST_TRIED), size))
+        found = differential_evolution(
+            loss, bounds, (loop.hardest,), init=np.vstack([np.array(starts).clip(lowest, largest), others]),
+            maxiter=GENERATIONS // (2 if quick else 1), tol=1e-4, seed=seed, polish=False,
+        )  # fmt: skip
+        done = minimize(loss, found.x, (loop,), method="Nelder-Mead", options=last)
+        return float(done.fun), done.x
+
+    # The best of both, as a search that follows one kind of start may not find what is better in the other.
+    narrow, inverting = _starts(loop)
+    every = [searched(0, narrow + inverting), *([] if quick else [searched(1, narrow)])]
+    return shape(min(every, key=lambda each: each[0])[1])
 
 
-def _starts(loop: Loop) -> list[list[float]]:
-    """Return logarithms of lead and low pass (s), and of frequency ratio, damping and width of each notch."""
+def _starts(loop: Loop) -> tuple[list[list[float]], list[list[float]]]:
+    """Return logarithms of lead and low pass (s), and of frequency ratio, damping and width of each notch, two kinds.
+
+    Of the second kind one notch is so wide that a proportional part cancels its slow pole: what is left inverts the
+    mode.
+    """
     none = log(NONE * loop.period)
     lags = [-1.0 / pole.real for pole in np.linalg.eigvals(loop.nominal.dynamics.a) if abs(pole.imag) < -pole.real]
     lag = log(max([loop.period, *(2.0 * mode.damping / mode.omega for mode in loop.modes), *lags]))
-    found = []
+    narrow, inverting = [], []
     for lead, low_pass in ((none, none), (lag, none), (lag, lag)):
         for least, width in ((0.0, 1.0), (DETUNING, 1.0), (2.0 * DETUNING, 5.0)):
             notches = [(0.0, log(max(mode.damping, least)), log(width)) for mode in loop.modes]
-            found.append([lead, low_pass, *(v for each in notches for v in each)])
-    # A notch so wide that a proportional part cancels its slow pole: what is left inverts the mode.
+            narrow.append([lead, low_pass, *(v for each in notches for v in each)])
     for (k, wide), least in product(enumerate(loop.modes), (DETUNING, 2.0 * DETUNING, 4.0 * DETUNING)):
         notches = [
             (0.0, log(max(mode.damping, least)), log(WIDE if j == k else 1.0)) for j, mode in enumerate(loop.modes)
         ]
-        found.append([log(2.0 * WIDE / wide.omega), none, *(v for each in notches for v in each)])
-    return found
+        inverting.append([log(2.0 * WIDE / wide.omega), none, *(v for each in notches for v in each)])
+    return narrow, inverting
 
 
 def _quieter(loop: Loop, best: Shape, margin: float) -> Shape:

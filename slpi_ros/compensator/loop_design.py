@@ -7,7 +7,6 @@ from itertools import product
 from math import ceil, inf, isfinite, log, pi, sqrt
 
 import numpy as np
-from numpy.typing import NDArray
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.compensator.feedback import PidGains
@@ -124,10 +123,15 @@ class Loop:
         return np.array(rows)
 
     @cached_property
-    def unknown(self) -> NDArray[np.bool_]:
-        """Which frequencies, shape (N,), are above `KNOWN` times all modes, and above what was measured."""
-        known = [KNOWN * mode.omega for mode in self.modes] + ([float(self.measured[0][-1])] if self.measured else [])
-        return np.asarray(self.omega > max(known, default=inf))
+    def unknown(self) -> FloatArray:
+        """How large the response (m/V) may be above `KNOWN` times all modes and what was measured, else 0, (N,)."""
+        several = [KNOWN * mode.omega for mode in self.modes] + ([float(self.measured[0][-1])] if self.measured else [])
+        known = max(several, default=inf)
+        # A lag that is as short may be a delay, which leaves large what is fast.
+        poles = np.linalg.eigvals(self.nominal.dynamics.a)
+        short = -poles.real[(np.abs(poles.imag) < 1e-9 * np.abs(poles)) & (-poles.real > known)]
+        less = np.prod(np.hypot(1.0, self.omega[:, None] / short), axis=1)
+        return np.asarray((self.omega > known) * UNKNOWN * less * np.max(np.abs(self.delayed), axis=0))
 
     @cached_property
     def z(self) -> ComplexArray:
@@ -146,12 +150,12 @@ class Loop:
         `margin` is kept at the slope of the largest loop, `LEAST_MARGIN` at the steepest slope, and where nothing is
         known of the stage whatever its phase.
         """
-        back = self.delayed * self.controller(shape)
+        controller = self.controller(shape)
+        back = self.delayed * controller
         size = back.real**2 + back.imag**2
         allowed = [_smallest(back, size, margin), _smallest(back, size, LEAST_MARGIN) / self.steep]
-        if self.unknown.any():
-            loudest = UNKNOWN * float(np.max(size[:, self.unknown])) ** 0.5
-            allowed.append((1.0 - LEAST_MARGIN) / max(loudest, 1e-300))
+        if loudest := float(np.max(self.unknown * np.abs(controller))):
+            allowed.append((1.0 - LEAST_MARGIN) / loudest)
         return min(allowed) if min(allowed) < inf else 0.0
 
     def bandwidth(self, shape: "Shape", integral: float) -> float:

@@ -66,8 +66,8 @@ class Loop:
     period: float
     large: float = 1.0  # slope of the largest loop over that of the nominal plant
     steep: float = 1.0  # steepest slope over that of the largest loop
-    # What was measured over what the model says, at rising frequencies (rad/s), (M,) each, 1 at the lowest: one more
-    # corner.
+    # What was measured over what the model says where it is steepest, at rising frequencies (rad/s), (M,) each: one
+    # more corner.
     measured: tuple[FloatArray, ComplexArray] | None = None
 
     @classmethod
@@ -116,6 +116,9 @@ class Loop:
         if self.measured:
             omega, ratio = self.measured
             sizes, angles = np.log(np.abs(ratio)), np.unwrap(np.angle(ratio))
+            # Small motions have less slope than larger ones, but not more than the model has for them.
+            slope = float(np.median(sizes[: max(3, sizes.size // 20)]))
+            sizes -= min(slope, -log(self.large * self.steep))
             # Modes that the model does not know are detuned, too.
             for scale in MEASURED_OFF:
                 size, angle = (np.interp(self.omega, scale * omega, of, left=0.0, right=0.0) for of in (sizes, angles))
@@ -254,8 +257,8 @@ def design(
         off by `DETUNING`, later messages and less damping, as far as the model is uncertain of it; where the loop is
         steepest `LEAST_MARGIN` is.
     measured : (ndarray, ndarray), shape (M,) each, optional
-        Frequencies, rad/s, and the measured response there over that of the model, 1 at the lowest: with it the margin
-        is kept, too.
+        Frequencies, rad/s, and the measured response there over that of the model where it is steepest: with it the
+        margin is kept, too, and with its slope if that is more than the model's for small motions.
 
     Returns
     -------

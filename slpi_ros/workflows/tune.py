@@ -67,10 +67,9 @@ def _measured(record: Record | None, name: str) -> FrequencyResponse | None:
 
 
 def beside_model(axis: AxisModel, measured: FrequencyResponse) -> tuple[FloatArray, ComplexArray] | None:
-    """Return frequencies (rad/s) and what was measured over what the model says, 1 at the lowest, (M,) each."""
+    """Return frequencies (rad/s) and what was measured over what the model says where it is steepest, (M,) each."""
     sure = measured.relative <= SURE
     if np.count_nonzero(sure) < 3:
         return None
     omega = 2.0 * pi * measured.frequency[sure]
-    ratio = measured.response[sure] / Plant.of(axis).response(omega)
-    return omega, ratio / np.median(np.abs(ratio[: max(3, ratio.size // 20)]))
+    return omega, measured.response[sure] / Plant.of(axis).response(omega)

@@ -124,6 +124,17 @@ def test_a_lag_that_is_a_delay_and_modes_that_are_none_leave_the_loop_stable():
     assert found.bandwidth > 15.0
 
 
+@pytest.mark.parametrize("twice", [1.0, 2.0])
+def test_a_measured_response_with_more_slope_than_that_of_the_model_counts_with_it(twice):
+    model, omega = STAGES["a light mode"], 2.0 * pi * np.linspace(2.0, 300.0, 100)
+    slope = design(model, RATE).plant.slope
+    measured = twice * Plant.of(model).response(omega) * slope / Plant.of(model).slope
+    found = design(model, RATE, measured=(omega, measured / Plant.of(model).response(omega)))
+    # As large motions have more slope than small ones, so much more is kept in reserve.
+    stage = replace(Plant.of(model), slope=twice * BARE.mean_slope)
+    assert DiscreteLoop(stage, found.gains, found.period).margins.modulus > 0.49
+
+
 @pytest.mark.parametrize("name", STAGES)
 def test_a_step_settles_as_told_and_without_an_error_that_stays(designs, name):
     found = designs[name]

@@ -37,6 +37,8 @@ def test_the_loop_of_the_page_takes_the_error_away(reader):
     save_model(StageModel({"x": axis}), folder / "model.json")
     (folder / "stage.yaml").write_text(
         "/**:\n  ros__parameters:\n    axes: ['x']\n    model_file: model.json\n    start_voltage: auto\n"
+        # That model is up to 25 V off, more than a correction may be by default.
+        "    correction_limit: 40.0\n"
     )
     blocks = [step.text for step in steps_of(DOCS / "how-to" / "close_the_loop.md") if step.what == "bash"]
     assert len(blocks) == 4

@@ -122,21 +122,24 @@ class Judge:
         known = min(same, key=lambda one: one.loss.square, default=None)
         return fit if known is None or known.loss.square >= fit.held_out.square else self._rebuilt(known)
 
-    def _senseless(self, now: Explanation) -> dict[str, float]:
-        """Return the effects that explain too little of what is there where they act, with that share."""
+    def _senseless(self, now: Explanation) -> list[str]:
+        """Return the effects that explain too little of what is there where they act."""
         rest = {name: self._without(now, name).held_out for name in self._free(now)}
-        shares = {name: share(now.held_out, without, self._noise) for name, without in rest.items()}
         single, little = len(now.evidence.parts) == 1, ABOVE_NOISE * now.noise
-        for name in shares:
+
+        def explains(name: str) -> bool:
             # A free course of one record is refuted by nothing but what it leaves, and of several records fits what
             # the others have in common, too: there it has to be more than noise.
             if now.effect(name).courses and (now.held_out.rms > little if single else rest[name].rms <= little):
-                shares[name] = -1.0
-        return {name: found for name, found in shares.items() if found < EXPLAINED}
+                return False
+            return share(now.held_out, rest[name], self._noise) >= EXPLAINED
+
+        return [name for name in rest if not explains(name)]
 
     def _meaningful(self, now: Explanation) -> Explanation:
+        """Return a joint fit without what is senseless, first that without which the rest predicts best."""
         while found := self._senseless(now):
-            now = self._without(now, min(found, key=lambda name: found[name]))
+            now = min((self._without(now, name) for name in found), key=lambda fit: fit.held_out.square)
         return now
 
     def _needed(self, now: Explanation, best: Explanation) -> Explanation:
@@ -170,7 +173,8 @@ class Judge:
         # drift, however many numbers they have.
         alone, single = one_speed(now.evidence), len(now.evidence.parts) == 1
         unproved = single and bool(effect.keys)
-        library = Library(rest, self._search.names)
+        # With the parameters beside the effect, which are not those without it.
+        library = Library(now.only({other.name for other in now.effects} - {name}, refine=False), self._search.names)
         present = {other.name for other in rest.effects} | (set() if effect.keys else {name})
         singles = library.screened((), (), present)
         if not (alone or unproved):

@@ -76,6 +76,7 @@ class Division:
 
     errors: FloatArray  # (n, K), of each column, the hysteresis fitted to the rest
     rest: FloatArray  # (K, K), products of the columns in the rest, the hysteresis eliminated
+    size: FloatArray  # (K,), root of the sum of squares of each column in all data
     place: IntArray  # (n,), where the errors belong; -1: not judged
     fold: IntArray  # (n,), fold of each row within a record that is left out; 0: never left out
     own: Mask  # (K,), columns that belong to the record left out alone; none for blocks of records
@@ -91,7 +92,8 @@ class Division:
         y, columns = self.errors[:, target].sum(axis=1), self.errors[:, chosen]
         matrix, vector = self.rest[np.ix_(chosen, chosen)], self.rest[np.ix_(chosen, target)].sum(axis=1)
         if not self.own.any() and not self.fold.any():
-            return np.asarray(y - columns @ solved(matrix, vector, [k in positive for k in chosen]))
+            gains = solved(matrix, vector, [k in positive for k in chosen], self.size[chosen])
+            return np.asarray(y - columns @ gains)
         beside = np.column_stack([columns, np.ones(y.size)])
         whole = UNDETERMINED * (beside.T @ beside)
         whole[:-1, :-1] += matrix
@@ -142,11 +144,16 @@ class HeldOut:
         return solved(self.whole[np.ix_(chosen, chosen)], vector, [k in positive for k in chosen])
 
 
-def solved(matrix: FloatArray, vector: FloatArray, positive: Sequence[bool] = ()) -> FloatArray:
-    """Return the solution, shape (k,), of normal equations, with unknowns that are not negative where `positive`."""
+def solved(
+    matrix: FloatArray, vector: FloatArray, positive: Sequence[bool] = (), size: FloatArray | None = None
+) -> FloatArray:
+    """Return the solution, shape (k,), of normal equations, with unknowns that are not negative where `positive`.
+
+    `size`, shape (k,), is that of the columns; what the equations do not determine beside it is zero.
+    """
     gains = np.zeros(vector.size)
     kept = np.arange(vector.size)
-    size = np.sqrt(np.maximum(np.diag(matrix), 1e-300))
+    size = np.maximum(np.sqrt(np.maximum(np.diag(matrix), 0.0)) if size is None else size, 1e-150)
     while kept.size:
         own = matrix[np.ix_(kept, kept)] / np.outer(size[kept], size[kept])
         found = _solved(own + RIDGE * np.eye(kept.size), vector[kept] / size[kept])

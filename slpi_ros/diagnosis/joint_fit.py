@@ -125,6 +125,7 @@ class Joint:
         projected = [rows.project(own) for rows, own in zip(self.rows, parts, strict=True)]
         products = [own.T @ own for own in parts]
         whole, inner = _sum(projected), _sum(products)
+        size = np.sqrt(np.diag(inner))
         held = [np.diag(_sum(products[k * each : (k + 1) * each])) > 0.0 for k in range(len(self.evidence.parts))]
         place, samples, records = self._places()
         divisions = []
@@ -143,7 +144,7 @@ class Joint:
             # What the others cannot predict of a record says nothing of its zero, nor of its drift.
             ends = [slice(self._ends[group], self._ends[group + 1]) for group in groups]
             known = np.concatenate([self.predictable[self._samples[rows]] | (record < 0) for rows in ends])
-            divisions.append(Division(np.asfortranarray(missed[known]), rest, places[known], fold[known], own))
+            divisions.append(Division(np.asfortranarray(missed[known]), rest, size, places[known], fold[known], own))
         total = inner - whole.T @ _solved(self.factor, whole)
         return HeldOut(divisions, total, samples, records, len(held), self.problem.scale)
 

@@ -83,7 +83,7 @@ class Creep(EffectBase):
 
     time_constants: tuple[float, ...] = parameter(
         "s", "time constants tau_k", 0, 1e7, above=True, default=(), count=(0, 100),
-        fit=Fit("relative", least=FASTEST, within_record=True),
+        fit=Fit("relative", least=FASTEST, within_record=True, ends=True),
     )  # fmt: skip
     gains: tuple[float, ...] = parameter(
         "", "shares g_k of the motion that follow with each", -0.9, 11, default=(), count=(0, 100),
@@ -227,7 +227,9 @@ class Creep(EffectBase):
         return changed | {"gains": _reduced(changed["time_constants"], changed["gains"])}
 
     def plausible(self, context: FitContext) -> bool:
-        """Return whether no gain, nor the sum of those that settle within a second, has ended at its upper bound."""
+        """Return whether some of it is slow, and no gain, nor the sum of those within a second, is at its bound."""
+        if self.time_constants and max(self.time_constants) <= FASTEST:
+            return False
         soon = sum(gain for tau, gain in zip(self.time_constants, self.gains, strict=True) if tau < SOON)
         bounds = (max(self.gains, default=0.0), LARGEST), (soon, LARGEST_SOON), (self.gain, LARGEST_POWER)
         return all(gain < (1.0 - NEAR) * most for gain, most in bounds)

@@ -46,6 +46,8 @@ class Fit:
     start: bool = False
     # Value that stays, as 0 of what is not there, or 1 of a mode that has all of the motion.
     stays: float = nan
+    # Whether it may mean something where the fit ends at a bound.
+    ends: bool = False
 
 
 @dataclass(frozen=True)
@@ -123,7 +125,9 @@ class Leaf(NamedTuple):
     def at_bound(self) -> bool:
         """Whether its fit ended at a bound, where it stands for something else; gains may be 0 or 1."""
         fit = self.facts.fit
-        return fit is not None and fit.kind != "linear" and not fit.least < self.value < fit.most and bool(self.value)
+        if fit is None or fit.ends or fit.kind == "linear":
+            return False
+        return bool(self.value) and not fit.least < self.value < fit.most
 
     @property
     def free(self) -> bool:

@@ -104,10 +104,11 @@ class Division:
         y = y - beside[:, ~own] @ gains[~own]
         beside = beside[:, own]
         square, product = beside.T @ beside, beside.T @ y
+        size = np.sqrt(np.diag(square))
         left = np.asarray(y - beside @ solved(square, product))
         for rows in self._judged:
             part = beside[rows]
-            left[rows] = y[rows] - part @ solved(square - part.T @ part, product - part.T @ y[rows])
+            left[rows] = y[rows] - part @ solved(square - part.T @ part, product - part.T @ y[rows], size=size)
         return left
 
 

@@ -65,7 +65,7 @@ class Delay(EffectBase):
 
     @classmethod
     def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
-        """Yield delays of both signs, from a fraction of a sampling interval to several intervals."""
+        """Yield delays of both signs, from a fraction of a sampling interval to many intervals."""
         dt = usual_step(context.t)
         for seconds in (-4.0 * dt, 0.5 * dt, 2.0 * dt, 8.0 * dt, 32.0 * dt):
             column = context.respond(cls(seconds).apply(context.u, context.around)) - context.h

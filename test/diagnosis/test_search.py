@@ -47,10 +47,13 @@ def names(now):
     return {effect.name for effect in now.effects}
 
 
-def test_what_acts_in_one_block_alone_is_not_extrapolated():
-    now = fit()
+@pytest.mark.parametrize("tiny", [0.0, 1e-22])
+@pytest.mark.parametrize("records", [1, 2])
+def test_what_acts_in_one_block_alone_is_not_extrapolated(records, tiny):
+    now = fit(records=records)
     # Elsewhere there is no more of it than rounding errors.
-    column = 1e-22 * np.random.default_rng(0).standard_normal(now.t.size)
+    column = tiny * np.random.default_rng(0).standard_normal(now.t.size)
+    column[3000:] = 0.0
     column[1500:1530] = 1e-8 * np.sin(np.arange(30.0))
     own = now.joint.sampled(np.column_stack([now.target, column]))
     assert now.joint.held_out(own).loss([0], [1]).rms == pytest.approx(now.held_out.rms, rel=0.05)

@@ -23,6 +23,8 @@ STREAMS = 2
 TOGETHER = ("fleet", "documentation")
 # Those that compute more than they wait, and need no core at any moment.
 COMPUTES = ("test_identify.py", "test_site.py")
+# Folders whose tests talk to simulated devices.
+DEVICES = ("drivers", "devices")
 # Younger shared memory is left alone, s.
 NEW_S = 10.0
 
@@ -71,7 +73,7 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if "nodes" in item.path.parent.name or "rclpy" in getattr(item.module, "__dict__", {}):
             item.add_marker("ros")
         # Simulated devices answer over sockets within time limits, as nodes do.
-        if repeats and (item.get_closest_marker("ros") or item.path.parent.name == "drivers"):
+        if repeats and (item.get_closest_marker("ros") or item.path.parent.name in DEVICES):
             item.add_marker(pytest.mark.flaky(reruns=1, reruns_delay=2))
         if "measured_data" in getattr(item, "fixturenames", ()):
             item.add_marker("measured")

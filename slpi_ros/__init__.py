@@ -10,7 +10,6 @@ from slpi_ros.errors import dependencies_needed
 
 if TYPE_CHECKING:
     from slpi_ros.diagnosis.diagnose import diagnose
-    from slpi_ros.diagnosis.verify import verify
     from slpi_ros.errors import SlpiError
     from slpi_ros.identification.fit import identify
     from slpi_ros.identification.record_quality import assess, findings
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
     from slpi_ros.model.axis_model import AxisModel
     from slpi_ros.model.document import load_model, save_model
     from slpi_ros.model.stage_model import HeldAtLimitWarning, StageModel
+    from slpi_ros.verification.verify import verify
 
 # Imported at first use: the compensator needs neither the identification nor the diagnosis.
 _MODULES = {
@@ -38,7 +38,7 @@ _MODULES = {
     "read_bag": "io.bag_reader",
     "refit": "identification.refit",
     "save_model": "model.document",
-    "verify": "diagnosis.verify",
+    "verify": "verification.verify",
 }
 
 __all__ = [

@@ -20,6 +20,7 @@ LAYERS = (
     {"reports"},
     {"calibration"},
     {"workflows", "export", "devices"},
+    {"verification"},
     {"diagnosis"},
     {"identification", "compensator"},
     {"learning"},
@@ -198,7 +199,7 @@ NAMING_EFFECTS = {"effects", "simulation"}
 NAMED_ELSEWHERE = {
     "model/sensor.py": ({"delay", "lag"}, "the known timing of a sensor is the physics of these two"),
     "identification/record_quality.py": ({"creep", "delay", "lag"}, "what a drive lacks, in words"),
-    "diagnosis/tracking.py": ({"delay"}, "a part of a tracking error"),
+    "verification/tracking.py": ({"delay"}, "a part of a tracking error"),
     "reports/verification.py": ({"delay"}, "the same, in words"),
     "compensator/loop_design.py": ({"delay"}, "what limits the bandwidth of a loop, in words"),
     "reports/tuning.py": ({"delay"}, "the same"),

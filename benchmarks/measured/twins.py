@@ -37,7 +37,7 @@ from benchmarks.measured.methods.nonlinear import BoucWen, EnvelopePlays, Modifi
 from benchmarks.measured.scores import Tables, fitted_series, free_run, split
 from slpi_ros import load_model, read_bag
 from slpi_ros.cli import main as slpi
-from slpi_ros.diagnosis.verify import verify
+from slpi_ros.verification.verify import verify
 
 # One task of each device with a motor of its own kind, small ones.
 TASKS = ("picma", "piezo_150v", "afm_double_sine", "ntnu2 20 Hz", "tendon 0.3 Hz")

@@ -13,12 +13,12 @@ from slpi_ros.compensator.loop_design import Design
 from slpi_ros.compensator.loop_margin import refusal
 from slpi_ros.compensator.monitor import Finding
 from slpi_ros.compensator.oscillation_rule import OscillationRule
-from slpi_ros.diagnosis.step_answers import HELD, StepAnswer
 from slpi_ros.errors import UsageError
 from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.limits import Limits, RateLimiter
 from slpi_ros.model.sensor import StreamingSensor
 from slpi_ros.model.stage_model import StageModel
+from slpi_ros.verification.step_answers import HELD, StepAnswer
 
 # Steps about the middle, and a raster, as shares of the displacement range; time of each setpoint, and of a period of
 # the raster if the slew limit allows it, seconds; number of periods.

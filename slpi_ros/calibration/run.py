@@ -16,7 +16,6 @@ from slpi_ros.calibration.settings import CALIBRATION, CalibrationSettings
 from slpi_ros.compensator.loop_design import design
 from slpi_ros.compensator.plausible import implausible_noise, implausible_stroke
 from slpi_ros.diagnosis.result import Diagnosis
-from slpi_ros.diagnosis.step_answers import step_answers
 from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.errors import RecordError, SlpiError, length
 from slpi_ros.excitation.drives import CALIBRATION as CALIBRATION_DRIVE
@@ -27,6 +26,7 @@ from slpi_ros.identification.signal_statistics import noise
 from slpi_ros.io.record import Record
 from slpi_ros.io.stage_name import same_stage
 from slpi_ros.model.stage_model import StageModel
+from slpi_ros.verification.step_answers import step_answers
 from slpi_ros.workflows.diagnose import DiagnoseRequest, diagnose
 from slpi_ros.workflows.identify import IdentifyRequest, identify
 from slpi_ros.workflows.records import Source

@@ -50,7 +50,6 @@ def _add_options(command: ArgumentParser) -> None:
 
 
 def _run(options: Namespace) -> Result:
-    from slpi_ros.diagnosis.verify import UNPROVED
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.io.schemas import format_document
     from slpi_ros.model.document import load_model
@@ -64,6 +63,7 @@ def _run(options: Namespace) -> Result:
         verification_limits,
         write_files,
     )
+    from slpi_ros.verification.verify import UNPROVED
     from slpi_ros.workflows.verify import VerifyRequest, verify
 
     source, tolerance = common.source_of(options), None

@@ -1,1 +1,1 @@
-"""Diagnosis of model errors on records, and verification of models."""
+"""Diagnosis of model errors on records: the effects that a model lacks."""

@@ -17,7 +17,6 @@ from urllib.parse import quote
 import numpy as np
 from threadpoolctl import threadpool_limits
 
-from slpi_ros.diagnosis.verify import Verification
 from slpi_ros.effects.registry import to_document
 from slpi_ros.errors import SlpiError
 from slpi_ros.fleet.sources import Bag
@@ -27,6 +26,7 @@ from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.document import load_model, save_model
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports import verification as verification_page
+from slpi_ros.verification.verify import Verification
 from slpi_ros.workflows.diagnose import DiagnoseRequest, diagnose
 from slpi_ros.workflows.identify import IdentifyRequest, identify
 from slpi_ros.workflows.records import Source, assess_record

@@ -170,8 +170,8 @@ class FitOutcome:
 def fit(request: FitRequest) -> FitOutcome:
     """Read the bags, identify the model and compare it with the one in use."""
     # Imported here because they load slowly: the compensator uses this module to read models only.
-    from slpi_ros.diagnosis.replacement import doubt_about
     from slpi_ros.model.sensor import Sensor
+    from slpi_ros.verification.replacement import doubt_about
     from slpi_ros.workflows.identify import IdentifyRequest, identify
     from slpi_ros.workflows.records import Source
 

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from slpi_ros.diagnosis.verify import RecordVerification, Verification, counted
 from slpi_ros.errors import SlpiError, length
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.io.digests import digests
@@ -22,6 +21,7 @@ from slpi_ros.model.uncertainty import COMPONENTS, COVERAGE_FACTOR, AxisUncertai
 from slpi_ros.reports.page import Page
 from slpi_ros.reports.uncertainty import PLACES, TIMES, uncertainty_document
 from slpi_ros.reports.verification import SEVERITY, record_notes
+from slpi_ros.verification.verify import RecordVerification, Verification, counted
 
 SCHEMA = "slpi_ros/certificate/1"
 FILES = "certificate.json", "certificate.html"

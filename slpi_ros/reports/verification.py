@@ -5,20 +5,6 @@ from pathlib import Path
 
 import numpy as np
 
-from slpi_ros.diagnosis.step_answers import StepAnswer
-from slpi_ros.diagnosis.tracking import CAUSES, Burst, ErrorPart, Tracking
-from slpi_ros.diagnosis.verify import (
-    FAILED,
-    FEW,
-    LEAST,
-    MOST_KNOWN,
-    PASSED,
-    TIMES_REPEATABILITY,
-    UNPROVED,
-    AxisVerification,
-    RecordVerification,
-    Verification,
-)
 from slpi_ros.errors import length
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.io.schemas import format_document
@@ -39,6 +25,20 @@ from slpi_ros.reports.chart import (
 )
 from slpi_ros.reports.chart import CAUSES as COLOURS
 from slpi_ros.reports.page import Page, Severity
+from slpi_ros.verification.step_answers import StepAnswer
+from slpi_ros.verification.tracking import CAUSES, Burst, ErrorPart, Tracking
+from slpi_ros.verification.verify import (
+    FAILED,
+    FEW,
+    LEAST,
+    MOST_KNOWN,
+    PASSED,
+    TIMES_REPEATABILITY,
+    UNPROVED,
+    AxisVerification,
+    RecordVerification,
+    Verification,
+)
 
 FILES = "verification.json", "report.html"
 TRACKING_ERROR = Quantity("measured - desired", "nm", 1e9, ".1f")

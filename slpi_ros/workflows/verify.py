@@ -4,12 +4,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from slpi_ros.diagnosis import verify as verification
-from slpi_ros.diagnosis.verify import Verification
 from slpi_ros.io.desired import desired_of
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import StartMemory
 from slpi_ros.model.stage_model import StageModel
+from slpi_ros.verification import verify as verification
+from slpi_ros.verification.verify import Verification
 from slpi_ros.workflows.records import (
     Findings,
     Source,

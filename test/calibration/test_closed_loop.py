@@ -14,7 +14,6 @@ from slpi_ros.calibration.run import calibrate
 from slpi_ros.compensator.feedback import PidGains
 from slpi_ros.compensator.gains_file import TunedGains
 from slpi_ros.compensator.loop_design import design
-from slpi_ros.diagnosis.step_answers import step_answers
 from slpi_ros.effects.filters import Mode
 from slpi_ros.effects.resonance import Resonance
 from slpi_ros.effects.sensor_periodic import SensorPeriodic
@@ -22,6 +21,7 @@ from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports.calibration import GAINS, write_files
 from slpi_ros.simulation.character import Character
+from slpi_ros.verification.step_answers import step_answers
 
 RATE, SLOPE = 200.0, 2e-7
 

@@ -9,7 +9,6 @@ import pytest
 from slpi_ros.diagnosis.diagnose import diagnose, following
 from slpi_ros.diagnosis.prepare import evidence_of, no_cause
 from slpi_ros.diagnosis.result import AMBIGUOUS
-from slpi_ros.diagnosis.verify import verify
 from slpi_ros.identification.fit import identify
 from slpi_ros.identification.refit import refit
 from slpi_ros.io.record import Record
@@ -17,6 +16,7 @@ from slpi_ros.simulation.axis import SimulatedAxis
 from slpi_ros.simulation.character import Character
 from slpi_ros.simulation.parameters import AxisParameters
 from slpi_ros.simulation.room import RoomSensor
+from slpi_ros.verification.verify import verify
 
 RATE, SECONDS = 10.0, 400.0
 T = np.arange(0.0, SECONDS, 1.0 / RATE)

@@ -4,11 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from slpi_ros.diagnosis.verify import verify
 from slpi_ros.errors import SlpiError, length
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.stage_model import StageModel
+from slpi_ros.verification.verify import verify
 
 # Least share of the voltage range of the model in use, and of its visited pairs of reversal and present voltage, that a
 # new model covers.

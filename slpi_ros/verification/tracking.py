@@ -8,8 +8,8 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.arrays.rates import rates
-from slpi_ros.diagnosis.step_answers import StepAnswer, followed_up_to, step_answers
 from slpi_ros.errors import RecordError
+from slpi_ros.verification.step_answers import StepAnswer, followed_up_to, step_answers
 
 # A delay is accepted if it reduces the difference between model and desired displacement by this factor.
 BETTER = 1.1

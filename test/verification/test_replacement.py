@@ -8,11 +8,11 @@ import pytest
 from refusals import holds
 from strategies import FAMILY_CASE, axis_model
 
-from slpi_ros.diagnosis.replacement import doubt_about
 from slpi_ros.errors import RecordError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import StageModel
+from slpi_ros.verification.replacement import doubt_about
 
 X = axis_model(FAMILY_CASE)
 LOW, HIGH = X.voltage_range
@@ -77,6 +77,6 @@ def test_a_model_in_use_that_cannot_be_compared_is_no_reason(monkeypatch):
     def fail(*_, **__):
         raise RecordError("too little data")
 
-    monkeypatch.setattr("slpi_ros.diagnosis.replacement.verify", fail)
+    monkeypatch.setattr("slpi_ros.verification.replacement.verify", fail)
     record = Record(np.arange(3), {"x": np.zeros(3)}, {"x": np.zeros(3)})
     assert doubt_about(of(held_out_rms=20e-9), of(), [record]) == ""

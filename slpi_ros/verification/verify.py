@@ -16,7 +16,6 @@ from scipy.ndimage import maximum_filter1d, minimum_filter1d
 from slpi_ros.arrays import FloatArray, IntArray, Mask
 from slpi_ros.arrays.rates import rates
 from slpi_ros.diagnosis.fingerprint import Left, Signals, lines_of
-from slpi_ros.diagnosis.tracking import ErrorPart, Tracking, track
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.hysteresis.slpi_published import UnidentifiedLoopWarning
 from slpi_ros.identification.cross_validation import level_classes, loop_levels, region_classes, speed_classes
@@ -27,6 +26,7 @@ from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import RESOLUTION, START_MEMORIES, AxisModel, StartMemory
 from slpi_ros.model.coverage import record_beyond, surroundings_beyond
 from slpi_ros.model.stage_model import StageModel
+from slpi_ros.verification.tracking import ErrorPart, Tracking, track
 
 SCHEMA = "slpi_ros/verification/2"
 # Default tolerance as a multiple of the repeatability.

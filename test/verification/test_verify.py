@@ -13,8 +13,6 @@ from reports.pages import parsed
 import slpi_ros
 import slpi_ros.io.bag_writer
 from slpi_ros.cli import main
-from slpi_ros.diagnosis.tracking import CAUSES
-from slpi_ros.diagnosis.verify import UNPROVED
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.io.schemas import validate
@@ -24,6 +22,8 @@ from slpi_ros.reports.verification import (
     verification_good,
     verification_limits,
 )
+from slpi_ros.verification.tracking import CAUSES
+from slpi_ros.verification.verify import UNPROVED
 
 SEED, RATE = 2, 200.0
 # Voltages between which a stage was moved before a record; the last one leads to where the record begins.

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.signal import lfilter
 
-from slpi_ros.diagnosis.step_answers import followed_up_to, step_answers
+from slpi_ros.verification.step_answers import followed_up_to, step_answers
 
 RATE, TAU, NOISE = 2000.0, 0.02, 1e-9
 

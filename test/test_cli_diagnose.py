@@ -314,7 +314,7 @@ def test_model_and_output_must_be_named(slpi, folder, tmp_path, left_out):
 def told(folder, after_rms=2e-9):
     """Return a diagnosis made by hand, of which everything is known."""
     t = np.arange(100) * 1e-3
-    lag = NamedEffect(Lag(0.015), 75.0, 0.9, 0.002, ("delay",), "It comes 15 ms late.")
+    lag = NamedEffect(Lag(0.015), 75.0, 0.9, 0.002, ("delay",), "it lags", "it comes 15 ms late.")
     axis = AxisDiagnosis(
         verdict=AMBIGUOUS,
         summary="lag or delay.",
@@ -335,7 +335,7 @@ def told(folder, after_rms=2e-9):
 def test_what_cannot_be_told_apart_comes_with_the_next_experiment(slpi, folder, tmp_path, monkeypatch):
     monkeypatch.setattr("slpi_ros.diagnosis.diagnose.diagnose", lambda *_, **__: told(folder))
     code, said, _ = slpi("diagnose", folder / "hum", "--model", folder / "model.json", "-o", tmp_path / "out")
-    lines = ["ambiguous", "lag or delay.", "lag: It comes 15 ms late.", "Go faster."]
+    lines = ["ambiguous", "lag or delay.", "lag: it lags; it comes 15 ms late.", "Go faster."]
     first, *told_lines, _, _ = said.splitlines()
     assert code == 0 and first.startswith("ERROR SOURCES: axis x: lag or delay")
     assert all(line.startswith("axis x: ") for line in told_lines)

@@ -14,10 +14,11 @@ from slpi_ros.diagnosis.answer import Answer, answer_of
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.joint_fit import Explanation
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of
-from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome, judged, signals_of
+from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome
 from slpi_ros.diagnosis.ruler import NO_WORSE, beats
 from slpi_ros.diagnosis.search import is_own, seen
 from slpi_ros.diagnosis.structures import BIAS
+from slpi_ros.diagnosis.verdict import judged, signals_of
 from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.chain import Chain
 from slpi_ros.effects.registry import EFFECTS, in_order

@@ -169,10 +169,9 @@ def _colours(count: int) -> list[str]:
 
 
 def _cause(named: NamedEffect) -> dict[str, str]:
-    described = named.effect.describe()
     said = {
-        "Description": described,
-        "Evidence": named.evidence.removeprefix(f"{described}; "),
+        "Description": named.description,
+        "Evidence": named.comparison,
         "Gain": f"{named.gain_percent:.1f} % less held-out error; "
         f"{named.share_of_residual:.0%} of the mean square error without effects",
         "p-value": f"{named.p_value:.2g}",

@@ -128,7 +128,7 @@ class Answers:
         records = [records] if isinstance(records, slpi_ros.Record) else records
         self.asked.append([record.source for record in records])
         alone = len(records) == 1
-        effect = NamedEffect(Creep((1.0,), (0.01,)), 40.0, 0.5, 0.01, ("lag",) if alone else (), "")
+        effect = NamedEffect(Creep((1.0,), (0.01,)), 40.0, 0.5, 0.01, ("lag",) if alone else (), "", "")
         advice = "Record `slpi excite -o drive.csv --voltage-min 0 --voltage-max 60 --for creep`."
         verdict, advice = ("ambiguous", advice) if alone else ("named", None)
         no = np.zeros(0)

@@ -35,7 +35,7 @@ def diagnosis(verdict, *effects, after=8e-9, floor=8e-9):
 
 
 def named(share, *alternatives):
-    return NamedEffect(Lag(0.005), 50.0, share, 0.001, alternatives, "")
+    return NamedEffect(Lag(0.005), 50.0, share, 0.001, alternatives, "", "")
 
 
 def test_before_a_diagnosis_conditions_without_a_record_are_recorded_once_for_each_axis():

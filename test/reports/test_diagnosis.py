@@ -43,8 +43,10 @@ def traces(size=6000):
 
 def found(**changes):
     effects = (
-        NamedEffect(Creep((1.0,), (0.02,)), 75.0, 0.85, 0.002, ("thermal_drift",), "Holds go on by 31 nm."),
-        NamedEffect(Hum((Line(50.0, 60e-9, 0.0),)), 84.0, 0.12, 0.002, (), "A line stands at 50 Hz."),
+        NamedEffect(
+            Creep((1.0,), (0.02,)), 75.0, 0.85, 0.002, ("thermal_drift",), "It creeps", "Holds go on by 31 nm."
+        ),
+        NamedEffect(Hum((Line(50.0, 60e-9, 0.0),)), 84.0, 0.12, 0.002, (), "It hums", "A line stands at 50 Hz."),
     )
     axis = AxisDiagnosis(
         verdict=NAMED,
@@ -84,6 +86,7 @@ def test_all_is_said_without_javascript(written):
         *("repeats: 9 moves", "150.0", "37.5", "6.0", "75.0 %", "0.002", "85%", "12%", "unexplained"),
     ):
         assert words in text
+    assert text.count("Holds go on by 31 nm.") == text.count("It creeps") == 1
     assert set(page.charts) == {f"{axis}-{chart}" for axis in "xy" for chart in CHARTS}
 
 
@@ -165,7 +168,7 @@ def test_commands_are_code_and_values_are_no_python(tmp_path):
 
 
 def test_hostile_texts_stay_text(tmp_path):
-    named = replace(found().effects[0], evidence=HOSTILE, alternatives=(HOSTILE,))
+    named = replace(found().effects[0], description=HOSTILE, comparison=HOSTILE, alternatives=(HOSTILE,))
     loud = replace(traces(), contributions={HOSTILE: traces().contributions["creep"]})
     axis = found(summary=HOSTILE, repeatability_source=HOSTILE, next_experiment=HOSTILE, effects=(named,), traces=loud)
     page = parsed(write(tmp_path, {HOSTILE: axis}, HOSTILE))

@@ -108,11 +108,6 @@ def names(effect: Effect) -> list[str]:
     return [place for place, _, _ in _fitted(effect)]
 
 
-def of_starts(effect: Effect) -> list[bool]:
-    """Return for each free parameter whether it is the state at the start of a record."""
-    return [fit.start for _, fit, _ in _fitted(effect)]
-
-
 def free(effect: Effect) -> FloatArray:
     """Return the values of the free parameters, shape (k,), SI, or their logarithms for logarithmic ones."""
     values = [log(max(value, fit.least)) if fit.kind == "logarithmic" else value for _, fit, value in _fitted(effect)]

@@ -116,22 +116,12 @@ class Evidence:
     @cached_property
     def others(self) -> Mapping[str, FloatArray]:
         """Displacements of the other axes that all records contain, relative to their start, shape (N,), metres."""
-        common = set.intersection(*(set(part.others) for part in self.parts))
-        return {
-            name: np.concatenate([part.others[name] for part in self.parts])
-            for name in self.parts[0].others
-            if name in common
-        }
+        return _in_all([part.others for part in self.parts])
 
     @cached_property
     def surroundings(self) -> Mapping[str, FloatArray]:
         """Quantities that all records contain, shape (N,), in their units."""
-        common = set.intersection(*(set(part.surroundings) for part in self.parts))
-        return {
-            key: np.concatenate([part.surroundings[key] for part in self.parts])
-            for key in self.parts[0].surroundings
-            if key in common
-        }
+        return _in_all([part.surroundings for part in self.parts])
 
     @property
     def courses(self) -> Mapping[str, Sequence[Course]]:
@@ -222,6 +212,12 @@ class Evidence:
         return Evidence((self.parts[k],), self.basis, self.smoothness)
 
 
+def _in_all(records: Sequence[Mapping[str, FloatArray]]) -> dict[str, FloatArray]:
+    """Return the signals that all records contain, by name, shape (N,)."""
+    common = [name for name in records[0] if all(name in one for one in records)]
+    return {name: np.concatenate([one[name] for one in records]) for name in common}
+
+
 def evidence_of(
     records: Sequence[Record], axis: str, model: AxisModel | None, start: float | None = None, stop: float | None = None
 ) -> Evidence:
@@ -304,11 +300,9 @@ def of_stage(record: Record, course: Course) -> str:
 
 def few(at: FloatArray) -> str:
     """Return how many readings there are, at times `at` (s, (n,)), and how many are needed; "" if enough."""
-    return (
-        ""
-        if at.size >= FEWEST_READINGS
-        else f"{at.size} readings at different times, at least {FEWEST_READINGS} are needed"
-    )
+    if at.size >= FEWEST_READINGS:
+        return ""
+    return f"{at.size} readings at different times, at least {FEWEST_READINGS} are needed"
 
 
 def uncovered(at: FloatArray, begins: float, ends: float) -> str:

@@ -459,6 +459,21 @@ class Effect(EffectBase, Protocol):
         """Describe the effect with its parameter values in one sentence."""
 
 
+class Additive(EffectBase, Protocol):
+    """An effect that adds a displacement, whatever the signal is."""
+
+    def added(self, around: EffectContext) -> FloatArray:
+        """Return the displacement that it adds, shape (N,), metres."""
+
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
+        """Return the displacement with it, shape (N,), metres."""
+        return signal + self.added(around)
+
+    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
+        """Return the displacement without it, shape (N,), metres."""
+        return signal - self.added(around)
+
+
 class AroundHysteresis(Effect, Protocol):
     """An effect around the hysteresis: its `apply` returns the voltage that the hysteresis feels."""
 
@@ -592,6 +607,17 @@ def usual_step(t: FloatArray) -> float:
 def longest(around: EffectContext) -> float:
     """Return the duration (s) of the longest record."""
     return max(float(t[-1] - t[0]) for t in around.split(around.t))
+
+
+def decays(time_constants: Sequence[float], around: EffectContext) -> FloatArray:
+    """Return what is left of 1 at the start of each record for each time constant (s), shape (N, k), by record."""
+    times = around.split(around.t)
+    whole = np.zeros((around.t.size, len(times) * len(time_constants)))
+    columns = iter(whole.T)
+    for rows, t in zip(around.split(np.arange(around.t.size)), times, strict=True):
+        for tau in time_constants:
+            next(columns)[rows] = np.exp(-(t - t[:1]) / tau)
+    return whole
 
 
 def is_course(*records: Sequence[float]) -> bool:

@@ -8,7 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, ResidualContext, Side, Signal
+from slpi_ros.effects.base import Additive, Candidate, EffectContext, ResidualContext, Side, Signal
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining
 from slpi_ros.effects.parameters import Fit, parameter, require
 
@@ -24,7 +24,7 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 
 @dataclass(frozen=True)
-class CrossCoupling(EffectBase):
+class CrossCoupling(Additive):
     """Linear coupling, ``y = x + sum_j gain_j m_j``, with ``m_j`` the motion of axis j; the stage model inverts it."""
 
     name: ClassVar[str] = "cross_coupling"
@@ -50,18 +50,10 @@ class CrossCoupling(EffectBase):
         least = sum(map(abs, self.gains.values())) < 0.9
         require(self, ("gains", least, "less than 0.9 in sum, to tell the axes apart"))
 
-    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement including the coupled motion, shape (N,), metres."""
-        return signal + self.part(signal, around)
-
-    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement without the coupled motion, shape (N,), metres."""
-        return signal - self.part(signal, around)
-
-    def part(self, signal: FloatArray, around: EffectContext) -> FloatArray:
+    def added(self, around: EffectContext) -> FloatArray:
         """Return the displacement caused by the other axes, shape (N,), metres."""
         known = (gain * around.others[axis] for axis, gain in self.gains.items() if axis in around.others)
-        return sum(known, np.zeros_like(signal))
+        return sum(known, np.zeros_like(around.t))
 
     @classmethod
     def fit(cls, context: ResidualContext) -> Iterator[Candidate]:

@@ -83,6 +83,13 @@ def loops(path: DrivePath, low: float, high: float, seconds: float, count: int, 
         path.to(low, seconds, straight=straight)
 
 
+def full_loops(path: DrivePath, limits: DriveLimits) -> None:
+    """Append full loops one after the other, at most 60 and as quick as allowed."""
+    quickest = max(limits.quickest(1.0), safe_duration(1.0))
+    count = min(max(int(remaining(limits) / (2 * quickest)), 3), 60)
+    loops(path, 0.0, 1.0, remaining(limits) / (2 * count), count)
+
+
 def at_speeds(path: DrivePath, limits: DriveLimits, low: float, high: float, *, straight: bool) -> None:
     """Append one loop at increasing speeds, with about the same time and at least two repeats at each speed."""
     count = 6

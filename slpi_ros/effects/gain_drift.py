@@ -20,7 +20,7 @@ from slpi_ros.effects.base import (
     StreamingBase,
     Unsure,
 )
-from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining, safe_duration
+from slpi_ros.effects.excitation import Excitation, full_loops
 from slpi_ros.effects.parameters import Fit, parameter, require
 
 # Numbers of uniform knots of the candidates. The first interval has more knots, spaced logarithmically (number per
@@ -30,12 +30,6 @@ UNIFORM, PER_DECADE, FEWEST = (1, 2, 4, 8), 2.0, 100
 OF_TRAVEL = (8, 16)
 # Largest gain: no piezo changes by more; and shortest duration (s).
 LARGEST, TAKES = 0.3, 10.0
-
-
-def _draw(path: DrivePath, limits: DriveLimits) -> None:
-    shortest = 2 * max(limits.quickest(1.0), safe_duration(1.0))
-    repeats = min(max(int(remaining(limits) / shortest), 3), 60)
-    loops(path, 0.0, 1.0, remaining(limits) / (2 * repeats), repeats)
 
 
 @dataclass(frozen=True)
@@ -57,7 +51,7 @@ class GainDrift(EffectBase):
         "Full loops one after the other, all alike and without a rest: voltage, memory and creep repeat, so a "
         "stroke that grows or shrinks is the sensitivity, where a drift moves both ends of each loop by the same "
         "(give it several minutes, or start after a rest).",
-        _draw,
+        full_loops,
         separates=("thermal_drift",),
         order=1,
     )
@@ -67,12 +61,9 @@ class GainDrift(EffectBase):
         "", "relative changes g of the sensitivity at the knots", -0.9, 10, above=True, fit=Fit("linear", 1e-5)
     )
     origin: float = parameter(
-        "m",
-        "displacement that does not change with the sensitivity",
-        -1e3,
-        1e3,
+        "m", "displacement that does not change with the sensitivity", -1e3, 1e3,
         fit=Fit("linear", 1e-9, near_motion=True),
-    )
+    )  # fmt: skip
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:

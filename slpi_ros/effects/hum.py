@@ -10,8 +10,8 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import (
+    Additive,
     Candidate,
-    EffectBase,
     EffectContext,
     FitContext,
     ResidualContext,
@@ -50,7 +50,7 @@ class Line:
 
 
 @dataclass(frozen=True)
-class Hum(EffectBase):
+class Hum(Additive):
     """Sinusoids in time, ``y = x + sum_k amplitude_k sin(2 pi frequency_k t + phase_k)``, on the record's clock."""
 
     name: ClassVar[str] = "hum"
@@ -83,18 +83,10 @@ class Hum(EffectBase):
             for drive, duration in context.drives()
         )
 
-    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement with the lines, shape (N,), metres."""
-        return signal + self.wave(around.t)
-
-    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement without the lines, shape (N,), metres."""
-        return signal - self.wave(around.t)
-
-    def wave(self, t: FloatArray) -> FloatArray:
-        """Return the sum of the lines, shape (N,), metres, at times `t`, shape (N,), seconds."""
-        waves = (one.amplitude * np.sin(2 * pi * one.frequency * t + one.phase) for one in self.lines)
-        return sum(waves, np.zeros_like(t))
+    def added(self, around: EffectContext) -> FloatArray:
+        """Return the sum of the lines, shape (N,), metres."""
+        waves = (one.amplitude * np.sin(2 * pi * one.frequency * around.t + one.phase) for one in self.lines)
+        return sum(waves, np.zeros_like(around.t))
 
     @classmethod
     def fit(cls, context: ResidualContext) -> Iterator[Candidate]:

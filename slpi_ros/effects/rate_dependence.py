@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from functools import partial
 from itertools import product
-from math import copysign, exp, sqrt
+from math import copysign, exp, log, sqrt
 from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
@@ -21,6 +21,7 @@ from slpi_ros.effects.base import (
     StreamingBase,
     TimeShift,
     Unsure,
+    by_record,
 )
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter
@@ -145,17 +146,15 @@ class RateDependence(EffectBase):
         lead *= self.reversible_gain
         return lead
 
+    @by_record
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the applied voltage, shape (N,), volts, for the felt voltage `signal`; it starts at equilibrium."""
-        whole = []
-        for t, u in zip(around.split(around.t), around.split(signal), strict=True):
-            dt, change, v = np.diff(t), np.diff(u), u.copy()
-            moving = np.where(dt > 0.0, np.arcsinh(change / (self.onset_rate * np.where(dt > 0.0, dt, 1.0))), 0.0)
-            # A change in no time leaves the difference as it was.
-            last = np.maximum.accumulate(np.where(dt > 0.0, np.arange(dt.size), -1))
-            v[1:] += self.threshold * np.where(last >= 0, moving[last], 0.0)
-            whole.append(v)
-        return np.concatenate(whole)
+        dt, change, v = np.diff(around.t), np.diff(signal), signal.copy()
+        moving = np.where(dt > 0.0, np.arcsinh(change / (self.onset_rate * np.where(dt > 0.0, dt, 1.0))), 0.0)
+        # A change in no time leaves the difference as it was.
+        last = np.maximum.accumulate(np.where(dt > 0.0, np.arange(dt.size), -1))
+        v[1:] += self.threshold * np.where(last >= 0, moving[last], 0.0)
+        return v
 
     @classmethod
     def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
@@ -185,7 +184,7 @@ class RateDependence(EffectBase):
 
     def describe(self) -> str:
         """Describe the widening for each decade of the rate, and where it begins."""
-        decade = self.threshold * 2.302585092994046
+        decade = self.threshold * log(10.0)
         beside = f"; a part of the motion, {self.reversible_gain * 1e9:.3g} nm per volt, follows the voltage at once"
         return (
             f"above {self.onset_rate:.3g} V/s, a voltage that changes ten times faster widens the loops by "

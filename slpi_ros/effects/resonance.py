@@ -26,16 +26,7 @@ from slpi_ros.effects.base import (
     usual_step,
 )
 from slpi_ros.effects.excitation import FEWEST_STEPS, DriveLimits, DrivePath, Excitation, loops, move, remaining
-from slpi_ros.effects.filters import (
-    LEAST_GAIN,
-    SPACING,
-    WIDEST,
-    Dynamics,
-    Mode,
-    StreamingMode,
-    filtered,
-    mode_poles,
-)
+from slpi_ros.effects.filters import LEAST_GAIN, SPACING, WIDEST, Dynamics, Mode, StreamingMode, filtered, mode_poles
 from slpi_ros.effects.parameters import parameter, require
 
 # A zero is near a mode up to this ratio of the squared frequencies, which is the largest gain of `Exact`.
@@ -385,11 +376,9 @@ class Resonance(EffectBase):
                 columns = [column(mode)]
                 if frequency in found and damping == DAMPINGS[0]:
                     # A mode that rings for long explains nothing beside its frequency: both are free to first order.
-                    near = (
-                        replace(mode, frequency=frequency * (1.0 + STEP * damping)),
-                        replace(mode, damping=damping * (1.0 + STEP)),
-                    )
-                    columns = [*(column(one) - columns[0] for one in near), *columns]
+                    tuned = replace(mode, frequency=frequency * (1.0 + STEP * damping))
+                    damped = replace(mode, damping=damping * (1.0 + STEP))
+                    columns = [*(column(one) - columns[0] for one in (tuned, damped)), *columns]
                 yield Candidate(np.column_stack(columns), partial(cls._if_seen, mode), positive=1)
                 if frequency not in found:
                     # All of the motion, as of a mirror on its bearing.

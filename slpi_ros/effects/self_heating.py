@@ -18,6 +18,7 @@ from slpi_ros.effects.base import (
     Side,
     Signal,
     StreamingBase,
+    decays,
     longest,
 )
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining, safe_duration
@@ -87,13 +88,9 @@ class SelfHeating(EffectBase):
         fit=Fit("relative", least=SHORTEST, within_record=True),
     )  # fmt: skip
     origin: float = parameter(
-        "m",
-        "displacement that does not change with the sensitivity",
-        -1e3,
-        1e3,
-        default=0.0,
+        "m", "displacement that does not change with the sensitivity", -1e3, 1e3, default=0.0,
         fit=Fit("linear", 1e-9, near_motion=True),
-    )
+    )  # fmt: skip
     # Of the records of the fit; any other one starts cold, as streaming does.
     initial: tuple[float, ...] = parameter(
         "V^2/s^2", "mean square rate of the voltage at the start of each record, 0: cold", 0, 1e18, default=(),
@@ -155,7 +152,7 @@ class SelfHeating(EffectBase):
             rates = _mean_square_rates(tau, context.around)
             if most := float(rates.max()):
                 moved = np.column_stack([context.h - low, np.full(rates.size, high - low)])
-                own, cooling = (rates / most)[:, None] * moved, _cooling(tau, context.around)
+                own, cooling = (rates / most)[:, None] * moved, decays([tau], context.around)
                 yield Candidate(own, partial(cls._through, tau, most, low, high))
                 warm = [cooling[:, [k]] * moved for k in range(cooling.shape[1])]
                 columns = np.column_stack([*warm, own])
@@ -251,12 +248,3 @@ def _mean_square_rates(
     times = around.split(around.t)
     parts = zip(times, around.split(around.voltage), (*initial, *(0.0,) * len(times)), strict=False)
     return np.concatenate([heated(np.diff(t, prepend=t[:1]), v, time_constant, first, most) for t, v, first in parts])
-
-
-def _cooling(time_constant: float, around: EffectContext) -> FloatArray:
-    """Return what is left of a mean square rate of 1 at the start of each record, shape (N, records)."""
-    times = around.split(around.t)
-    whole = np.zeros((around.t.size, len(times)))
-    for k, (rows, t) in enumerate(zip(around.split(np.arange(around.t.size)), times, strict=True)):
-        whole[rows, k] = np.exp(-(t - t[0]) / time_constant)
-    return whole

@@ -9,7 +9,7 @@ from typing import ClassVar
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, FitContext, ResidualContext, Side, Signal
+from slpi_ros.effects.base import Additive, Candidate, EffectContext, FitContext, ResidualContext, Side, Signal
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, move, remaining
 from slpi_ros.effects.jumps import follows_drive, jumps, sudden
 from slpi_ros.effects.parameters import Fit, parameter, require
@@ -26,7 +26,7 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 
 @dataclass(frozen=True)
-class Steps(EffectBase):
+class Steps(Additive):
     """Jumps of the zero, ``y = x + sum of the sizes at times up to t``, on the record's clock."""
 
     name: ClassVar[str] = "steps"
@@ -77,17 +77,9 @@ class Steps(EffectBase):
         left = np.interp(context.t, context.t[context.used], context.left_without(self.name)[context.used])
         return [sudden(left, k, size) for k, size in zip(places, self.sizes, strict=True)]
 
-    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement with the jumps, shape (N,), metres."""
-        return signal + self.path(around.t)
-
-    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement without the jumps, shape (N,), metres."""
-        return signal - self.path(around.t)
-
-    def path(self, t: FloatArray) -> FloatArray:
-        """Return the sum of the jumps up to times `t`, shape (N,), seconds, shape (N,), metres."""
-        return np.append(0.0, np.cumsum(self.sizes))[np.searchsorted(self.times, t, side="right")]
+    def added(self, around: EffectContext) -> FloatArray:
+        """Return the sum of the jumps so far, shape (N,), metres."""
+        return np.append(0.0, np.cumsum(self.sizes))[np.searchsorted(self.times, around.t, side="right")]
 
     @classmethod
     def fit(cls, context: ResidualContext) -> Iterator[Candidate]:

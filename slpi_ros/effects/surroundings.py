@@ -21,9 +21,10 @@ from slpi_ros.effects.base import (
     Signal,
     StreamingBase,
     Unsure,
+    decays,
     longest,
 )
-from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining, safe_duration
+from slpi_ros.effects.excitation import Excitation, full_loops
 from slpi_ros.effects.filters import filtered, hold
 from slpi_ros.effects.parameters import Fit, Leaf, parameter, require, text
 from slpi_ros.effects.readings import ReadingsFilter, best_filter, line_after
@@ -38,12 +39,6 @@ TIME_CONSTANTS, SHORTEST, LONGEST = 6, 1.0, 0.5
 LEADS = (1.5, 6.0)
 # Largest plausible change of the sensitivity.
 LARGEST = 0.3
-
-
-def _draw(path: DrivePath, limits: DriveLimits) -> None:
-    shortest = 2 * max(limits.quickest(1.0), safe_duration(1.0))
-    repeats = min(max(int(remaining(limits) / shortest), 3), 60)
-    loops(path, 0.0, 1.0, remaining(limits) / (2 * repeats), repeats)
 
 
 @dataclass(frozen=True)
@@ -115,7 +110,7 @@ class Surroundings(EffectBase):
         "Full loops one after the other while one quantity alone is changed on purpose, up and down several times and "
         "each time for another while (heat on and off, load on and off): what comes and goes with it is its doing, "
         "and no drift does that.",
-        _draw,
+        full_loops,
         separates=("thermal_drift", "gain_drift", "surroundings"),
         order=3,
     )
@@ -216,7 +211,7 @@ class Surroundings(EffectBase):
 
     def starting(self, around: EffectContext, used: Mask) -> FloatArray:
         """Return what is left of before each record for each quantity with a time constant, shape (N, k)."""
-        return np.column_stack([np.empty((around.t.size, 0)), *_settling(self._lags, around).values()])
+        return decays(self._lags, around)
 
     def started(self, amplitudes: FloatArray, records: int) -> "Surroundings":
         """Return the effect with what is left of before its records."""
@@ -231,9 +226,7 @@ class Surroundings(EffectBase):
         return tuple(one.time_constant for one in self.quantities if one.time_constant)
 
     def _left(self, around: EffectContext) -> FloatArray:
-        if not self.initial:
-            return np.zeros_like(around.t)
-        columns = list(_settling(self._lags, around).values())
+        columns = decays(self._lags, around).T if self.initial else ()
         pairs = zip(self.initial, columns, strict=False)
         return sum((amplitude * column for amplitude, column in pairs), np.zeros_like(around.t))
 
@@ -256,14 +249,14 @@ class Surroundings(EffectBase):
                 size = float(np.abs(follows).max())
                 if not size > 0.0:
                     continue
-                starting = [*_settling((tau,), around).values()] if tau else []
+                starting = decays([tau] if tau else [], around)
                 moved = follows / size
                 for with_offset, with_sensitivity in ((True, False), (False, True), (True, True)):
                     own_columns = [moved] * with_offset + [moved * (context.h - low)] * with_sensitivity
                     yield Candidate(
-                        np.column_stack([*starting, *own_columns]),
+                        np.column_stack([starting, *own_columns]),
                         partial(cls._through, one, size, low, with_offset, len(own_columns)),
-                        starting=len(starting),
+                        starting=starting.shape[1],
                         group=group,
                     )
 
@@ -398,17 +391,6 @@ def _lagged(value: FloatArray, time_constant: float, around: EffectContext) -> F
         moved = grid.on(own - own[0])
         parts.append(own[0] + grid.off(filtered([now, before], [1.0, -kept], moved)))
     return np.concatenate(parts)
-
-
-def _settling(time_constants: Sequence[float], around: EffectContext) -> dict[tuple[int, int], FloatArray]:
-    """Return what is left of 1 m at the start of each record for each time constant, shape (N,) each, by both."""
-    columns = {}
-    for k, (rows, t) in enumerate(zip(around.split(np.arange(around.t.size)), around.split(around.t), strict=True)):
-        for place, tau in enumerate(time_constants):
-            whole = np.zeros(around.t.size)
-            whole[rows] = np.exp(-(t - t[:1]) / tau)
-            columns[k, place] = whole
-    return columns
 
 
 def _described(one: Quantity) -> str:

@@ -8,15 +8,7 @@ from typing import ClassVar
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import (
-    Candidate,
-    EffectBase,
-    EffectContext,
-    FitContext,
-    ResidualContext,
-    Side,
-    Signal,
-)
+from slpi_ros.effects.base import Additive, Candidate, EffectContext, FitContext, ResidualContext, Side, Signal
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, Leaf, parameter, require
 
@@ -39,7 +31,7 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 
 @dataclass(frozen=True)
-class ThermalDrift(EffectBase):
+class ThermalDrift(Additive):
     """A displacement that depends on time only, linear between knots and constant outside."""
 
     name: ClassVar[str] = "thermal_drift"
@@ -87,13 +79,9 @@ class ThermalDrift(EffectBase):
         pairs = zip(np.diff(self.values).tolist(), np.diff(self.times).tolist(), strict=True)
         return self.times[-1] >= TAKES and all(abs(dy) <= RATE * context.motion * dt for dy, dt in pairs)
 
-    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement with drift, shape (N,), metres."""
-        return signal + np.interp(around.t, self.times, self.values)
-
-    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the displacement without drift, shape (N,), metres."""
-        return signal - np.interp(around.t, self.times, self.values)
+    def added(self, around: EffectContext) -> FloatArray:
+        """Return the drift, shape (N,), metres."""
+        return np.interp(around.t, self.times, self.values)
 
     def from_end(self) -> tuple["ThermalDrift", float]:
         """Return the drift that ends at zero, and the displacement (m) at the end."""

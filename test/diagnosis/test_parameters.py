@@ -7,7 +7,7 @@ import pytest
 from effects.cases import EVERY
 from hypothesis import given
 
-from slpi_ros.diagnosis.effect_parameters import EachRecord, bounded, certain, free, moved, names, of_starts, steps
+from slpi_ros.diagnosis.effect_parameters import EachRecord, bounded, certain, free, moved, names, steps
 from slpi_ros.effects.base import is_course
 from slpi_ros.effects.parameters import facts_of
 from slpi_ros.effects.rate_dependence import RateDependence
@@ -42,7 +42,7 @@ def test_a_start_that_is_none_stays_none():
     """The state at the start of a record is free only where the record shows one."""
     law = RateDependence(1.0, 0.1, 1e-8, (0.0, -2.0))
     assert names(law) == ["threshold", "onset_rate", "reversible_gain", "initial.1"]
-    assert of_starts(law) == [False, False, False, True]
+    assert [leaf.facts.fit.start for leaf in law.free_leaves()] == [False, False, False, True]
     values = free(law)
     values[-1] = 1e-9
     assert moved(law, values).initial == (0.0, 0.0)

@@ -311,8 +311,10 @@ def test_parameters_survive_the_document(effect):
 
 def test_lists_are_joined():
     """Lines add up, modes share the motion, and what an axis has once is not joined."""
-    t, one, other = np.arange(100) * 1e-3, Hum((Line(50.0, 1e-9, 0.1),)), Hum((Line(60.0, 2e-9, 0.2),))
-    np.testing.assert_allclose(one.joined(other).wave(t), one.wave(t) + other.wave(t), rtol=0, atol=1e-20)
+    around = EffectContext(np.arange(100) * 1e-3)
+    one, other = Hum((Line(50.0, 1e-9, 0.1),)), Hum((Line(60.0, 2e-9, 0.2),))
+    both = one.added(around) + other.added(around)
+    np.testing.assert_allclose(one.joined(other).added(around), both, rtol=0, atol=1e-20)
     both = Resonance((Mode(100.0, 0.1, 0.9),)).joined(Resonance((Mode(300.0, 0.1, 0.9),)))
     assert [mode.gain for mode in both.modes] == [0.5, 0.5] and both.rest == 0.0
     twice = Steps((1.0, 2.0), (1e-9, 3e-9)).joined(Steps((1.5, 2.0), (5e-9, 1e-9)))

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 from effects.residuals import Residual
 
-from slpi_ros.effects.base import FitContext
+from slpi_ros.effects.base import EffectContext, FitContext
 from slpi_ros.effects.jumps import follows_drive, jumps
 from slpi_ros.effects.steps import Steps
 
 T = np.arange(20_000) / 1000.0
+AROUND = EffectContext(T)
 V = 50.0 - 50.0 * np.cos(2 * np.pi * 0.7 * T)
 NOISE = 8e-9
 JUMPS = Steps((3.2345, 9.8765, 10.2345), (3 * NOISE, -5 * NOISE, 4 * NOISE))
@@ -33,7 +34,7 @@ def view(y, more=0.0):
 
 @pytest.mark.parametrize("seed", range(4))
 def test_small_jumps_are_found_where_they_are(seed):
-    found = sorted(jumps(noisy(JUMPS.path(T), seed), 12))
+    found = sorted(jumps(noisy(JUMPS.added(AROUND), seed), 12))
     assert [k for k, _ in found] == pytest.approx([3235, 9877, 10235], abs=4)
     assert [size for _, size in found] == pytest.approx(JUMPS.sizes, abs=0.5 * NOISE)
 
@@ -47,7 +48,7 @@ def test_the_candidates_hold_ever_more_jumps():
     h = 2e-7 * V
     forms = list(Steps.fit(Residual(T, V, h, noisy(h))))
     assert {form.columns.shape[1] for form in forms} == {0} and forms[0].effect(np.empty(0)) == Steps((), ())
-    forms = list(Steps.fit(Residual(T, V, h, noisy(h + JUMPS.path(T)))))
+    forms = list(Steps.fit(Residual(T, V, h, noisy(h + JUMPS.added(AROUND)))))
     assert [form.columns.shape[1] for form in forms][:4] == [1, 2, 3, 3]
     found = forms[2].effect(np.array(JUMPS.sizes))
     assert found.times == pytest.approx(JUMPS.times, abs=5e-3) and found.sizes == JUMPS.sizes
@@ -56,17 +57,17 @@ def test_the_candidates_hold_ever_more_jumps():
 
 
 def test_jumps_are_plausible_if_sudden_and_where_the_voltage_does_not_turn():
-    assert JUMPS.plausible(view(noisy(JUMPS.path(T))))
+    assert JUMPS.plausible(view(noisy(JUMPS.added(AROUND))))
     # What another effect explains, such as ringing, does not blur them.
-    assert JUMPS.plausible(view(noisy(JUMPS.path(T)), 100 * NOISE * np.sin(2 * np.pi * 90.0 * T)))
+    assert JUMPS.plausible(view(noisy(JUMPS.added(AROUND)), 100 * NOISE * np.sin(2 * np.pi * 90.0 * T)))
     ramp = np.interp(T, (9.0, 10.0), (0.0, 10 * NOISE))
     assert not Steps((9.5,), (10 * NOISE,)).plausible(view(noisy(ramp)))
     # One that is none goes, the others stay.
     mixed = Steps((*JUMPS.times, 19.5), (*JUMPS.sizes, 10 * NOISE))
-    left = view(noisy(JUMPS.path(T)))
+    left = view(noisy(JUMPS.added(AROUND)))
     assert not mixed.plausible(left) and mixed.only_plausible(left) == JUMPS
     turns = Steps(tuple(k / 1.4 + 5e-4 for k in range(1, 6)), tuple(10 * NOISE * (-1) ** k for k in range(5)))
-    assert not turns.plausible(view(noisy(turns.path(T))))
+    assert not turns.plausible(view(noisy(turns.added(AROUND))))
     assert not follows_drive(np.array([5000, 9000]), V)
 
 

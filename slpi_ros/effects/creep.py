@@ -118,12 +118,9 @@ class Creep(EffectBase):
     @cached_property
     def chain(self) -> FloatArray:
         """Time constants (s) and gains of its relaxations, shape (2, K)."""
-        given = np.array([self.time_constants, self.gains])
-        return (
-            given
-            if isinf(self.exponent)
-            else np.array([_power_times(self.exponent), self.gain * _power(self.exponent)])
-        )
+        if isinf(self.exponent):
+            return np.array([self.time_constants, self.gains])
+        return np.array([_power_times(self.exponent), self.gain * _power(self.exponent)])
 
     @property
     def unsure(self) -> Unsure:
@@ -379,10 +376,7 @@ def _power(exponent: float) -> FloatArray:
 
 
 def _settling(
-    time_constants: Sequence[float] | FloatArray,
-    around: EffectContext,
-    used: Mask,
-    gains: FloatArray | None = None,
+    time_constants: Sequence[float] | FloatArray, around: EffectContext, used: Mask, gains: FloatArray | None = None
 ) -> FloatArray:
     """Return the decay of creep that began before each record, shape (N, k), one column per identifiable relaxation."""
     # A law, logarithmic or with the `gains` of a power of time, has a single column, for a move just before the record.

@@ -46,12 +46,9 @@ class Delay(EffectBase):
     )
 
     seconds: float = parameter(
-        "s",
-        "delay of the displacement; negative: stamped too early",
-        -100,
-        100,
+        "s", "delay of the displacement; negative: stamped too early", -100, 100,
         fit=Fit("linear", in_samples, size=True),
-    )
+    )  # fmt: skip
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     @by_record

@@ -52,12 +52,8 @@ class Dynamics(NamedTuple):
         """Return these dynamics followed by others."""
         across = np.outer(other.b, self.c)
         a = np.block([[self.a, np.zeros_like(across.T)], [across, other.a]])
-        return Dynamics(
-            a,
-            np.concatenate([self.b, other.b * self.d]),
-            np.concatenate([other.d * self.c, other.c]),
-            self.d * other.d,
-        )
+        b, c = np.concatenate([self.b, other.b * self.d]), np.concatenate([other.d * self.c, other.c])
+        return Dynamics(a, b, c, self.d * other.d)
 
 
 # What follows at once.

@@ -60,7 +60,9 @@ class Lag(EffectBase):
         """Return the lagged voltage, shape (N,), volts; exact if the command is linear between samples."""
         grid = around.uniform
         now, before, kept = hold(grid.dt, self.time_constant)
-        lagged = grid.off(_filter(np.array([now, before]), np.array([1.0, -kept]), grid.on(signal)))
+        v = grid.on(signal)
+        # Before its start the signal was constant; a constant one is unchanged.
+        lagged = grid.off(v[:1] + filtered([now, before], [1.0, -kept], v - v[:1]))
         return lagged - around.step(signal) * np.exp(-around.since / self.time_constant)
 
     @classmethod
@@ -128,8 +130,9 @@ class StreamingLag(StreamingBase):
         """Return the command (V) for the lagged voltage `wanted` (V); for ``dt = 0`` return `wanted`."""
         if dt <= 0.0:
             return wanted
-        now, before, kept = _damped(self._over(dt))
-        return wanted + (kept * (wanted - self._output) + before * (wanted - self._input)) / now
+        now, before, kept = self._over(dt)
+        shift = DAMPING * before
+        return wanted + (kept * (wanted - self._output) + (before - shift) * (wanted - self._input)) / (now + shift)
 
     def snapshot(self) -> tuple[float, float]:
         """Return command and lagged voltage (V)."""
@@ -143,14 +146,3 @@ class StreamingLag(StreamingBase):
         if dt != self._dt:
             self._dt, self._hold = dt, hold(dt, self._time_constant)
         return self._hold
-
-
-def _damped(real: Hold) -> Hold:
-    shift = DAMPING * real.before
-    return Hold(real.now + shift, real.before - shift, real.kept)
-
-
-def _filter(numerator: FloatArray, denominator: FloatArray, signal: FloatArray) -> FloatArray:
-    """Filter a signal, shape (N,), that was constant before its start; a constant signal is unchanged."""
-    start = signal[:1]
-    return np.asarray(start + filtered(numerator, denominator, signal - start), dtype=np.float64)

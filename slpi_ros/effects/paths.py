@@ -59,11 +59,8 @@ def heated(dt: FloatArray, v: FloatArray, time_constant: float, first: float, mo
 
 
 # Of any damping.
-hold, mode_transition, mode_poles = (
-    compiled(filters.hold),
-    compiled(filters.mode_transition),
-    compiled(filters.mode_poles),
-)
+hold, mode_poles = compiled(filters.hold), compiled(filters.mode_poles)
+mode_transition = compiled(filters.mode_transition)
 
 
 # Functions that are called at each sample take few arrays: counting references to each costs as much as the arithmetic.
@@ -85,12 +82,8 @@ def creep_over(dt: float, creep: FloatArray) -> None:
     creep[last, STEP], creep[last, SUM_NOW], creep[last, SUM_BEFORE] = dt, 0.0, 0.0
     for k in range(last):
         gain, one = creep[k, GAIN], hold(dt, creep[k, TAU])
-        creep[k, NOW], creep[k, BEFORE], creep[k, KEPT], creep[k, SHARE] = (
-            one.now,
-            one.before,
-            one.kept,
-            gain * one.kept,
-        )
+        creep[k, NOW], creep[k, BEFORE], creep[k, KEPT] = one.now, one.before, one.kept
+        creep[k, SHARE] = gain * one.kept
         creep[last, SUM_NOW] += gain * one.now
         creep[last, SUM_BEFORE] += gain * one.before
 
@@ -195,12 +188,9 @@ def unringing(dt: float, wanted: float, factors: FloatArray, f: int, gaps: Float
             total, product = mode_poles(factors[f, OMEGA], factors[f, DAMPED], spacing)
             a, b, c = 1.0 / (1 - total + product), -total / (1 - total + product), product / (1 - total + product)
         delay = factors[f, 3] / spacing + b + 2 * c
-        factors[f, MATRIX], factors[f, taps], factors[f, taps + 1] = (
-            spacing,
-            a * (1 + delay),
-            b * (1 + delay) - a * delay,
-        )
-        factors[f, taps + 2], factors[f, taps + 3] = c * (1 + delay) - b * delay, -c * delay
+        factors[f, MATRIX], factors[f, taps] = spacing, a * (1 + delay)
+        factors[f, taps + 1], factors[f, taps + 2] = b * (1 + delay) - a * delay, c * (1 + delay) - b * delay
+        factors[f, taps + 3] = -c * delay
     later, earlier, at, value = 0.0, dt, spacing, wanted
     needed, k = factors[f, taps] * wanted, 1
     for place in range(last - 1, first - 1, -1):

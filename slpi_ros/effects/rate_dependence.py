@@ -160,7 +160,8 @@ class RateDependence(EffectBase):
     def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
         """Yield laws over a grid of thresholds and onset rates, with a free reversible gain."""
         rate, span = float(np.sqrt(np.mean(np.gradient(context.u, context.t) ** 2))), float(np.ptp(context.u))
-        holds = [_hold(t, u, y, span) for t, u, y in _records(context)]
+        records = zip(*(context.around.split(each) for each in (context.t, context.u, context.y)), strict=True)
+        holds = [_hold(t, u, y, span) for t, u, y in records]
         for group, onsets in enumerate(ONSETS):
             for share, onset in product(THRESHOLDS, onsets):
                 one = cls(share * span, onset * rate)
@@ -274,10 +275,6 @@ class StreamingRateDependence(StreamingBase):
         """Go back to the voltages before this sample; what it found remains the first guess."""
         self._v, self._u = state
         self._wish = None
-
-
-def _records(context: ResidualContext) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
-    yield from zip(*(context.around.split(signal) for signal in (context.t, context.u, context.y)), strict=True)
 
 
 def _hold(t: FloatArray, u: FloatArray, y: FloatArray, span: float) -> float:

@@ -454,9 +454,8 @@ def zeros(modes: Sequence[Mode], rest: float) -> list[Mode]:
     roots = sorted(np.linalg.eigvals(np.block([[nothing, stiff], [-stiff.T, -loss]])), key=abs)[1:]
     # Of two that are conjugate one stands for both; those that do not oscillate are pairs in order.
     lags = [root for root in roots if not root.imag]
-    pairs = [(root, root.conjugate()) for root in roots if root.imag > 0] + list(
-        zip(lags[::2], lags[1::2], strict=True)
-    )
+    pairs = [(root, root.conjugate()) for root in roots if root.imag > 0]
+    pairs += zip(lags[::2], lags[1::2], strict=True)
     found = [(sqrt(abs(one * other)), -(one + other).real / 2) for one, other in pairs]
     # With rounding errors.
     return [Mode(omega / (2 * pi), max(float(rate / omega), 1e-9)) for omega, rate in sorted(found)]

@@ -335,8 +335,9 @@ def keep(specimen: Specimen, seed: int, passes: int, errors: Mapping[str, Any]) 
     """Keep the row of a raster that repeats."""
     what = (
         f"a raster of 20 Hz that repeats, simulated stage with a mode of {specimen.frequency:.0f} Hz and "
-        f"{1e9 * specimen.noise:.1f} nm of sensor noise, rms error: inverse alone; PI feedback; `learn` after {passes} "
-        "passes; learning without a model of the dynamics: from a straight line, from the inverse"
+        f"{1e9 * specimen.noise:.1f} nm of sensor noise, rms error: inverse alone; proportional-integral "
+        f"feedback; `learn` after {passes} passes; learning without a model of the dynamics: from a straight line, "
+        "from the inverse"
     )
     last = {each: errors[each][-1] for each in ("PI", "learner", "line", "inverse")}
     figures = [errors["learner"][0], *last.values()]

@@ -90,7 +90,12 @@ class Creep(EffectBase):
         fit=Fit("linear", 1e-5, 0.0),
     )  # fmt: skip
     origin: float = parameter(
-        "m", "displacement h_0 to which creep adds nothing; null: that at the start", -1e3, 1e3, default=inf, none=True
+        "m",
+        "displacement h_0 to which creep adds nothing; null, and always for a power of time: that at the start",
+        -1e3,
+        1e3,
+        default=inf,
+        none=True,
     )
     # Only `apply` includes the creep after it; streaming starts at equilibrium.
     initial: float = parameter("m", "step of the displacement just before the record", -1e3, 1e3, default=0.0)
@@ -263,7 +268,10 @@ class Creep(EffectBase):
         return {"relaxations": self.chain, "rest_of_creep": self.origin}
 
     def anchored(self, rest: float) -> "Creep":
-        """Return the creep with the origin `rest` (m) unless it has one."""
+        """Return the creep with the origin `rest` (m) unless it has one; a power of time counts from each start."""
+        # After a rest without end it would have gone without bound, so that no displacement is its equilibrium.
+        if not isinf(self.exponent):
+            return replace(self, origin=inf)
         return self if self.origin < inf else replace(self, origin=rest)
 
     def streaming(self) -> "StreamingCreep":
@@ -284,7 +292,8 @@ class StreamingCreep(StreamingBase):
 
     def start(self, x: float) -> None:
         """Initialise to equilibrium at `x` (m)."""
-        self._origin = self._creep.anchored(x).origin
+        origin = self._creep.anchored(x).origin
+        self._origin = x if isinf(origin) else origin
         self._input = x - self._origin
         self._states = [self._input] * len(self._gains)
 

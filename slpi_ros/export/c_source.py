@@ -201,7 +201,9 @@ class _Tables:
             self._numbers(threshold=threshold, onset_rate=onset, reversible_gain=gain)
         if has.creep:
             self.fields["relaxations"] = str(laws.relaxations.shape[1])
-            self._numbers(creep_origin=laws.rest_of_creep if laws.relaxations.size else 0.0)
+            from_start = isinf(laws.rest_of_creep)
+            self.fields["creep_from_start"] = str(int(from_start))
+            self._numbers(creep_origin=0.0 if from_start else laws.rest_of_creep)
             self._add("creep_tau", laws.relaxations[0])
             self._add("creep_gain", laws.relaxations[1])
         if has.contact:

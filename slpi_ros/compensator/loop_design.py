@@ -101,7 +101,8 @@ class Loop:
         """Frequencies, rad/s, shape (N,): dense around the modes of all corners."""
         highest = pi / self.period
         poles = np.concatenate([np.linalg.eigvals(each.dynamics.a) for each in (self.nominal, *self.corners)])
-        slowest = min([highest, *np.abs(poles), 1.0 / max(self.nominal.delay, 1e-9)])
+        first = [float(self.measured[0][0])] if self.measured else []
+        slowest = min([highest, *np.abs(poles), 1.0 / max(self.nominal.delay, 1e-9), *first])
         near = (np.abs(poles.imag)[:, None] - poles.real[:, None] * BESIDE).ravel()
         spread = [2.0 * pi * mode.frequency * np.linspace(0.7, 1.4, 60) for mode in self.modes]
         seen = [scale * self.measured[0] for scale in MEASURED_OFF] if self.measured else []

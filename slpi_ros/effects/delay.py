@@ -62,11 +62,12 @@ class Delay(EffectBase):
 
     @classmethod
     def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
-        """Yield delays of both signs, from a fraction of a sampling interval to many intervals."""
+        """Yield delays of both signs, from a fraction of a sampling interval to several, and of many intervals."""
         dt = usual_step(context.t)
-        for seconds in (-4.0 * dt, 0.5 * dt, 2.0 * dt, 8.0 * dt, 32.0 * dt):
-            column = context.respond(cls(seconds).apply(context.u, context.around)) - context.h
-            yield Candidate(column[:, None], partial(cls._times, seconds))
+        for group, intervals in enumerate(((-4.0, 0.5, 2.0, 8.0), (32.0,))):
+            for seconds in (dt * each for each in intervals):
+                column = context.respond(cls(seconds).apply(context.u, context.around)) - context.h
+                yield Candidate(column[:, None], partial(cls._times, seconds), group=group)
 
     @classmethod
     def _times(cls, seconds: float, gains: FloatArray) -> "Delay":

@@ -135,6 +135,15 @@ def test_a_measured_response_with_more_slope_than_that_of_the_model_counts_with_
     assert DiscreteLoop(stage, found.gains, found.period).margins.modulus > 0.49
 
 
+def test_dynamics_that_were_measured_only_have_a_bandwidth_however_low():
+    stage, omega = rung((195.0, 0.24, 1.0), delay=1.7e-3), 2.0 * pi * np.linspace(1.7, 280.0, 60)
+    found = design(BARE, 4281.0, measured=(omega, Plant.of(stage).response(omega) / Plant.of(BARE).response(omega)))
+    slope = min(BARE.mean_slope, Plant.of(BARE).slope)
+    margins = DiscreteLoop(replace(Plant.of(stage), slope=slope), found.gains, found.period).margins
+    assert margins.modulus > 0.49
+    assert found.bandwidth == pytest.approx(oracle(BARE, found)[1], rel=0.01) and found.bandwidth > 0.5
+
+
 @pytest.mark.parametrize("name", STAGES)
 def test_a_step_settles_as_told_and_without_an_error_that_stays(designs, name):
     found = designs[name]

@@ -5,10 +5,10 @@ from dataclasses import dataclass, replace
 
 from slpi_ros.diagnosis.effect_parameters import free
 from slpi_ros.diagnosis.held_out import Loss
-from slpi_ros.diagnosis.joint_fit import Explanation
+from slpi_ros.diagnosis.joint_fit import JointFit
 from slpi_ros.diagnosis.prepare import one_speed
 from slpi_ros.diagnosis.ruler import EXPLAINED, beats, chance, share
-from slpi_ros.diagnosis.search import CONVERGED, MOST_EFFECTS, Fitted, Form, Library, Search
+from slpi_ros.diagnosis.search import CONVERGED, MOST_EFFECTS, EffectSet, Form, Library, Search
 from slpi_ros.diagnosis.structures import STRUCTURES
 from slpi_ros.model.axis_model import ABOVE_NOISE
 
@@ -48,8 +48,8 @@ class Named:
 class Answer:
     """The set of effects that a diagnosis gives: joint fit without and with it."""
 
-    base: Explanation
-    now: Explanation
+    base: JointFit
+    now: JointFit
     # The largest gain first; each gain is relative to the preceding effects.
     named: tuple[Named, ...] = ()
     # Defects of the hysteresis model: `BIAS`, or keys of `STRUCTURES`.
@@ -76,7 +76,7 @@ class Judge:
         self._search, self._base = search, search.base
         self._evidence, self._noise = search.base.evidence, search.base.noise
         # The last fit of which effects were left out, and the fits without each.
-        self._whole, self._rest = search.base, dict[str, Explanation]()
+        self._whole, self._rest = search.base, dict[str, JointFit]()
 
     def answer(self) -> Answer:
         """Return the answer."""
@@ -84,7 +84,7 @@ class Judge:
         self._evidence, self._noise = now.evidence, now.noise
         best = now = self._meaningful(now)
         for fitted in sorted(self._search.pool.values(), key=lambda one: (one.numbers, one.loss.square)):
-            if fitted.numbers >= Fitted.of(now).numbers:
+            if fitted.numbers >= EffectSet.of(now).numbers:
                 break
             if not self._beats(best.held_out, fitted.loss):
                 fewer = self._rebuilt(fitted)
@@ -101,14 +101,14 @@ class Judge:
     def _beats(self, one: Loss, other: Loss) -> bool:
         return beats(one, other, self._noise, self._search.trials)
 
-    def _rebuilt(self, fitted: Fitted) -> Explanation:
-        return Explanation(self._evidence, fitted.effects, self._base).refined(CONVERGED)
+    def _rebuilt(self, fitted: EffectSet) -> JointFit:
+        return JointFit(self._evidence, fitted.effects, self._base).refined(CONVERGED)
 
-    def _free(self, now: Explanation) -> list[str]:
+    def _free(self, now: JointFit) -> list[str]:
         """Return the names of the effects that were found."""
         return [effect.name for effect in now.effects if effect.name not in self._search.fixed]
 
-    def _without(self, now: Explanation, name: str) -> Explanation:
+    def _without(self, now: JointFit, name: str) -> JointFit:
         """Return the best joint fit of the other effects."""
         if now is not self._whole:
             self._whole, self._rest = now, {}
@@ -116,13 +116,13 @@ class Judge:
             self._rest[name] = self._best_without(now, name)
         return self._rest[name]
 
-    def _best_without(self, now: Explanation, name: str) -> Explanation:
+    def _best_without(self, now: JointFit, name: str) -> JointFit:
         fit = now.without(name).refined(CONVERGED)
-        same = [one for one in self._search.pool.values() if one.names == Fitted.of(fit).names]
+        same = [one for one in self._search.pool.values() if one.names == EffectSet.of(fit).names]
         known = min(same, key=lambda one: one.loss.square, default=None)
         return fit if known is None or known.loss.square >= fit.held_out.square else self._rebuilt(known)
 
-    def _senseless(self, now: Explanation) -> list[str]:
+    def _senseless(self, now: JointFit) -> list[str]:
         """Return the effects that explain too little of what is there where they act."""
         rest = {name: self._without(now, name).held_out for name in self._free(now)}
         single, little = len(now.evidence.parts) == 1, ABOVE_NOISE * now.noise
@@ -136,22 +136,22 @@ class Judge:
 
         return [name for name in rest if not explains(name)]
 
-    def _meaningful(self, now: Explanation) -> Explanation:
+    def _meaningful(self, now: JointFit) -> JointFit:
         """Return a joint fit without what is senseless, first that without which the rest predicts best."""
         while found := self._senseless(now):
             now = min((self._without(now, name) for name in found), key=lambda fit: fit.held_out.square)
         return now
 
-    def _needed(self, now: Explanation, best: Explanation) -> Explanation:
+    def _needed(self, now: JointFit, best: JointFit) -> JointFit:
         """Return a joint fit without the effects that it, or the best one, does not need."""
         while True:
             rest = [self._without(now, name) for name in self._free(now)]
             spare = [one for one in rest if not all(self._beats(each.held_out, one.held_out) for each in (now, best))]
             if not spare:
                 return now
-            now = min(spare, key=lambda one: (Fitted.of(one).numbers, one.held_out.square))
+            now = min(spare, key=lambda one: (EffectSet.of(one).numbers, one.held_out.square))
 
-    def _exchanged(self, now: Explanation) -> tuple[Explanation, dict[str, tuple[Rival, ...]]]:
+    def _exchanged(self, now: JointFit) -> tuple[JointFit, dict[str, tuple[Rival, ...]]]:
         """Return the fit with the better ones of the rivals of its effects, and for each effect the others."""
         rivals: dict[str, tuple[Rival, ...]] = {}
         for _ in range(MOST_EFFECTS):
@@ -166,7 +166,7 @@ class Judge:
             now = better
         return now, rivals
 
-    def _in_its_place(self, now: Explanation, name: str) -> tuple[Explanation | None, tuple[Rival, ...]]:
+    def _in_its_place(self, now: JointFit, name: str) -> tuple[JointFit | None, tuple[Rival, ...]]:
         """Return the joint fit with another effect, better or as good with fewer numbers, if any; all rivals."""
         rest, effect = self._without(now, name), now.effect(name)
         # One drive frequency does not tell effects apart that depend on time, and one record not a quantity from a
@@ -180,7 +180,7 @@ class Judge:
         if not (alone or unproved):
             singles = [form for form in singles if form.numbers <= free(effect).size]
         choices = sorted((library.choice(frozenset(), (form,)) for form in singles), key=lambda one: one.square)
-        found, tried = list[tuple[str, Explanation]](), dict[str, int]()
+        found, tried = list[tuple[str, JointFit]](), dict[str, int]()
         for choice in [one for one in choices if one.square < rest.held_out.square]:
             (form,) = choice.forms
             tried[form.name] = tried.get(form.name, 0) + 1
@@ -194,9 +194,9 @@ class Judge:
                 continue
             found.append((" ".join([form.name, *fit.effect(form.name).keys]), fit))
         found.sort(key=lambda pair: pair[1].held_out.square)
-        rivals, better, own = list[Rival](), list[Explanation](), Fitted.of(now).numbers
+        rivals, better, own = list[Rival](), list[JointFit](), EffectSet.of(now).numbers
         for label, fit in found:
-            as_good, numbers = not self._beats(now.held_out, fit.held_out), Fitted.of(fit).numbers
+            as_good, numbers = not self._beats(now.held_out, fit.held_out), EffectSet.of(fit).numbers
             other = fit.effect(label.partition(" ")[0])
             fewer = numbers < own or (numbers == own and fit.held_out.square < now.held_out.square)
             if as_good and (unproved and other.courses or fewer and not (single and other.keys and effect.courses)):
@@ -204,9 +204,11 @@ class Judge:
             if numbers <= own or alone:
                 as_good = as_good or (alone and self._beats(fit.held_out, rest.held_out))
                 rivals.append(Rival(label, fit.held_out, as_good))
-        return min(better, key=lambda fit: (Fitted.of(fit).numbers, fit.held_out.square), default=None), tuple(rivals)
+        return min(better, key=lambda fit: (EffectSet.of(fit).numbers, fit.held_out.square), default=None), tuple(
+            rivals
+        )
 
-    def _named(self, now: Explanation, rivals: dict[str, tuple[Rival, ...]]) -> tuple[Named, ...]:
+    def _named(self, now: JointFit, rivals: dict[str, tuple[Rival, ...]]) -> tuple[Named, ...]:
         """Return the effects, each with its gain when added to the preceding ones, the largest gain first."""
         left, taken, before, ordered = self._free(now), list(self._search.fixed), self._base.held_out, []
         while left:
@@ -235,6 +237,6 @@ class Judge:
         return replace(answer, structures=(min(found)[1],)) if found else answer
 
 
-def answer_of(base: Explanation, names: Sequence[str] | None = None) -> Answer:
+def answer_of(base: JointFit, names: Sequence[str] | None = None) -> Answer:
     """Return the answer for a joint fit without effects, of all effects or of those with these `names`."""
     return Judge(Search(base, names)).answer()

@@ -12,7 +12,7 @@ from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.arrays.rates import fastest
 from slpi_ros.diagnosis.answer import Answer, answer_of
 from slpi_ros.diagnosis.effect_parameters import EachRecord
-from slpi_ros.diagnosis.joint_fit import Explanation
+from slpi_ros.diagnosis.joint_fit import JointFit
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome
 from slpi_ros.diagnosis.ruler import NO_WORSE, beats
@@ -127,7 +127,7 @@ def following(
         with threadpool_limits(1):
             evidence = evidence_of(undone, axis, replace(known, sensor=IDEAL), start, stop)
             names = [name for name, effect in EFFECTS.items() if effect.follows_quantities]
-            now = answer_of(Explanation(evidence, ()), names).now
+            now = answer_of(JointFit(evidence, ()), names).now
             follows = [key for effect in now.effects for key in effect.keys]
             if follows:
                 axes[axis] = replace(_extended(known, now, source), sensor=known.sensor)
@@ -156,11 +156,11 @@ def _diagnose_axis(
     evidence = evidence_of(records, axis, model, start, stop)
     same = len(records) == 1 and model.quality.source == records[0].source
     # Effects that belong to one record (drift, lines, the knots of a gain drift) do not apply to another.
-    shared = [effect.anew for effect in model.effects if same or not is_own(effect)]
-    base = Explanation(evidence, shared)
+    shared = [effect.without_records for effect in model.effects if same or not is_own(effect)]
+    base = JointFit(evidence, shared)
     known = [effect for effect in shared if effect.in_phase(seen(base))]
     if len(known) < len(shared):
-        base = Explanation(evidence, known)
+        base = JointFit(evidence, known)
     # Other kinds are not refitted; a comparison with the loop family shows whether they are suitable.
     fitted = model.kind in REFITTED
     family = evidence_of(records, axis, None, start, stop) if model.kind == "pi" else None
@@ -221,7 +221,7 @@ def _extension(model: AxisModel, answer: Answer, given: Given, source: str) -> _
     return _Extension(extended, _runs(extended, answer.now), _runs(extended, answer.now, own=True))
 
 
-def _runs(model: AxisModel, now: Explanation, *, own: bool = False) -> list[FreeRun]:
+def _runs(model: AxisModel, now: JointFit, *, own: bool = False) -> list[FreeRun]:
     """Return the free run of an extended model on each of its records, with what goes on from before it.
 
     With `own`, also with the effects of each record, such as drift.
@@ -248,37 +248,37 @@ def _carries_over(after: Sequence[FreeRun], runs: Sequence[FreeRun]) -> bool:
     return all(one.rms <= NO_WORSE * before.rms for one, before in zip(after, runs, strict=True))
 
 
-def _answer(base: Explanation, of_family: Evidence | None) -> Answer:
+def _answer(base: JointFit, of_family: Evidence | None) -> Answer:
     """Return the answer, found with a coarser hysteresis if that is as good, and the joint fit without effects."""
     evidence, coarse = base.evidence, base.evidence.coarse
     if coarse is evidence:
         return _of_kind(base, of_family)
-    quick = Explanation(coarse, base.effects)
+    quick = JointFit(coarse, base.effects)
     answer = _of_kind(quick, of_family.coarse if of_family else None)
     finest = of_family if of_family and BIAS in answer.structures else evidence
     # A smoothness that suits few vertices may leave many without any hold.
     finer = replace(answer.now.evidence, basis=finest.basis, smoothness=evidence.smoothness)
-    now = Explanation(finer, answer.now.effects).smoothed().refined(REFINED)
+    now = JointFit(finer, answer.now.effects).smoothed().refined(REFINED)
     as_good = now.held_out.rms <= COARSER * answer.now.held_out.rms
     return replace(answer, base=base, now=now) if as_good else answer
 
 
-def _of_kind(base: Explanation, of_family: Evidence | None) -> Answer:
+def _of_kind(base: JointFit, of_family: Evidence | None) -> Answer:
     """Return the answer, with the loop family as hysteresis if that predicts better than the kind of `base`."""
     if of_family is None:
         return answer_of(base)
-    family = Explanation(of_family, base.effects)
+    family = JointFit(of_family, base.effects)
     found = None
     if not beats(family.held_out, base.held_out, base.noise):
         found = answer_of(base)
-        with_effects = Explanation(of_family, found.now.effects).refined(2)
+        with_effects = JointFit(of_family, found.now.effects).refined(2)
         if not beats(with_effects.held_out, found.now.held_out, found.now.noise):
             return found
     answer = answer_of(family)
     return replace(answer, base=base, structures=(BIAS, *answer.structures))
 
 
-def _repeatability(now: Explanation) -> Repeatability:
+def _repeatability(now: JointFit) -> Repeatability:
     """Return the largest repeatability of the records, between the rounding error and the held-out error."""
     repeats = [repeatability_of(part.t, part.v, part.y, residual) for part, residual in now.residuals]
     worst = max(repeats, key=lambda one: one.rms)
@@ -341,11 +341,11 @@ def _fits_anew(model: AxisModel, answer: Answer, own: Mask, given_rms: float) ->
     allowed = max(AS_ONCE * max(model.quality.held_out_rms, answer.now.noise), LITTLE * given_rms)
     if min(answer.base.held_out.rms, answer.now.held_out.rms) <= allowed:
         return True
-    alone = [Explanation(evidence.of_record(k)) for k in np.flatnonzero(~own).tolist()] if own.size > 1 else []
+    alone = [JointFit(evidence.of_record(k)) for k in np.flatnonzero(~own).tolist()] if own.size > 1 else []
     return bool(alone) and all(one.held_out.rms <= allowed for one in alone)
 
 
-def _compared(bare: AxisModel, one: Explanation) -> Given:
+def _compared(bare: AxisModel, one: JointFit) -> Given:
     """Compare the given hysteresis with the measured displacement minus the effects of the joint fit `one`."""
     errors, refitted, gains, deviations = [], [], [], []
     # Like the given hysteresis, the refitted one has monotone branches.
@@ -376,13 +376,13 @@ def _compared(bare: AxisModel, one: Explanation) -> Given:
     )
 
 
-def _since(own: Mask, one: Explanation) -> Given:
+def _since(own: Mask, one: JointFit) -> Given:
     """Compare new records with those from which the given model was identified, the mask `own`, shape (records,)."""
     # The given model has absorbed the effects in its own records, which act differently in others. Therefore the
     # residuals of one joint fit to all records show whether the stage has changed in between.
     found = []
     for part, rows in zip(one.evidence.parts, one.evidence.slices, strict=True):
-        chosen = _known(part) & one.joint.predictable[rows]
+        chosen = _known(part) & one.equations.predictable[rows]
         enough = np.count_nonzero(chosen) >= FEWEST
         found.append(_gain(one.h[rows][chosen], (one.target - one.settling)[rows][chosen]) if enough else (0.0, np.inf))
     gains, deviations = np.array(found).T
@@ -422,7 +422,7 @@ def _gain(h: FloatArray, target: FloatArray) -> tuple[float, float]:
     return whole, float(np.sqrt(np.sum(np.square(parts))) / max(float(moved @ moved), 1e-300))
 
 
-def _outcomes(runs: Sequence[FreeRun], runs_after: Sequence[FreeRun], now: Explanation) -> tuple[RecordOutcome, ...]:
+def _outcomes(runs: Sequence[FreeRun], runs_after: Sequence[FreeRun], now: JointFit) -> tuple[RecordOutcome, ...]:
     """Return the errors of each record in the free runs of the given and of the extended model."""
     several = len(now.evidence.parts) > 1
     errors = np.sqrt(now.held_out.records).tolist()
@@ -433,7 +433,7 @@ def _outcomes(runs: Sequence[FreeRun], runs_after: Sequence[FreeRun], now: Expla
     )
 
 
-def _extended(model: AxisModel, now: Explanation, source: str) -> AxisModel:
+def _extended(model: AxisModel, now: JointFit, source: str) -> AxisModel:
     """Return the model with jointly fitted hysteresis and effects, in the initial state of the first record."""
     evidence, first = now.evidence, now.evidence.parts[0]
     hysteresis, starts = now.hysteresis()
@@ -479,7 +479,7 @@ def _from_end(model: AxisModel, by: float) -> AxisModel:
     return replace(moved, displacement_range=model.displacement_range)
 
 
-def _errors(now: Explanation) -> list[tuple[FloatArray, ...]]:
+def _errors(now: JointFit) -> list[tuple[FloatArray, ...]]:
     """Return times (s), displacements, residuals, and residuals with what belongs to each record (m), used samples."""
     drift = np.zeros_like(now.predicted)
     for effect in now.effects:

@@ -63,11 +63,11 @@ UNCERTAIN, LOOKED_AT = 10.0, 1000
 FINEST = 1e-6
 
 
-class Joint:
+class Equations:
     """Normal equations of the hysteresis of one axis, to which columns of effects can be added."""
 
     # The voltage `u` (V, (N,)) drives the hysteresis. `like` are equations of the same records.
-    def __init__(self, evidence: Evidence, u: FloatArray, like: "Joint | None" = None) -> None:
+    def __init__(self, evidence: Evidence, u: FloatArray, like: "Equations | None" = None) -> None:
         if like and len(evidence.parts) > 1:
             self.predictable = like.predictable
         self.problem, self.evidence, self.u = evidence.problem(u), evidence, u
@@ -206,20 +206,20 @@ class Joint:
 
 @dataclass(frozen=True)
 class Columns:
-    """Columns of a joint fit with the hysteresis, shape (n, k), `at` the fitted samples, from `Joint.sampled`."""
+    """Columns of a joint fit with the hysteresis, shape (n, k), `at` the fitted samples, from `Equations.sampled`."""
 
-    joint: Joint
+    equations: Equations
     at: FloatArray
 
     @cached_property
     def whole(self) -> FloatArray:
         """Product ``A'J`` of all groups, shape (p, k)."""
-        return self.joint.everything.project(self.at)
+        return self.equations.everything.project(self.at)
 
     @cached_property
     def solved(self) -> FloatArray:
         """Hysteresis parameters, shape (p, k), of the best fit to each column."""
-        return _solved(self.joint.factor, self.whole)
+        return _solved(self.equations.factor, self.whole)
 
     @cached_property
     def _products(self) -> FloatArray:
@@ -229,12 +229,12 @@ class Columns:
     def precision(self) -> FloatArray:
         """Inverse covariance of the gains of the columns, shape (k, k), m^2, for independent errors of 1 m."""
         left: FloatArray = self._products - self.whole.T @ self.solved
-        return left * self.joint.problem.scale**2
+        return left * self.equations.problem.scale**2
 
     def fit(self, y: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Fit hysteresis and columns to all samples of `y` (m, (N,)); return parameters (p,) and gains (k,)."""
         # The parameters are in units of the problem's scale, without the constraint of monotone branches.
-        own = self.joint.columns(y)
+        own = self.equations.columns(y)
         solved = np.column_stack([own.solved, self.solved])
         cross = self.at.T @ own.at
         products = np.block([[own.at.T @ own.at, cross.T], [cross, self._products]])
@@ -345,19 +345,19 @@ class Anderson:
         return np.asarray(x + change - gains @ (of_x + of_change))
 
 
-class Explanation:
+class JointFit:
     """Joint fit of the hysteresis and of effects, which are in the order of the signal chain; signals (m, (N,))."""
 
     # The equations of `like`, a fit to the same evidence, are reused if the same voltage `u` (V) drives the hysteresis.
     # `h` is the displacement of the hysteresis, `added` the contribution of the effects on the displacement and of the
     # reversible path parallel to the hysteresis, and `settling` the relaxation in each record from moves before it,
     # with the columns `beside` of the evidence. `began` (m, (k,)) holds its amplitudes, record by record, by effect.
-    joint: Joint
+    equations: Equations
     h: FloatArray
     added: FloatArray
     settling: FloatArray
 
-    def __init__(self, evidence: Evidence, effects: Sequence[Effect] = (), like: "Explanation | None" = None) -> None:
+    def __init__(self, evidence: Evidence, effects: Sequence[Effect] = (), like: "JointFit | None" = None) -> None:
         self.evidence, self.effects = evidence, in_order(effects)
         applied, self.u, self._aside = Chain.of(self.effects).reaching(evidence.v, evidence.around)
         # Context passed to the effects.
@@ -365,13 +365,13 @@ class Explanation:
         if like and not evidence.poses_as(like.evidence):
             like = None
         if like and np.array_equal(like.u, self.u):
-            self.joint = like.joint
+            self.equations = like.equations
         else:
-            self.joint = Joint(evidence, self.u, like.joint if like else None)
+            self.equations = Equations(evidence, self.u, like.equations if like else None)
         starting = [one.starting(evidence.around, evidence.used) for one in self.effects]
         self.starts = np.cumsum([0, *(columns.shape[1] for columns in starting)]).tolist()
         self.before = np.column_stack([*starting, evidence.beside])
-        beside = self.joint.columns(self.before)
+        beside = self.equations.columns(self.before)
         behind = any(effect.acts_on == "displacement" for effect in self.effects)
         self.added = self._aside
         if not behind or not like:
@@ -406,7 +406,7 @@ class Explanation:
 
     def _fit(self, beside: Columns) -> None:
         self._x, gains = beside.fit(self.target)
-        self.h = self.joint.predict(self._x)
+        self.h = self.equations.predict(self._x)
         self.settling = self.before @ gains
         self.began = {
             effect.name: gains[first:end]
@@ -457,7 +457,7 @@ class Explanation:
     def respond(self, u: FloatArray) -> FloatArray:
         """Return the displacement of the hysteresis, shape (N,), metres, for another voltage `u`, shape (N,), volts."""
         response = self.evidence.predict(self.evidence.samples(u), self._x)[self.evidence.rows]
-        return response * self.joint.problem.scale
+        return response * self.equations.problem.scale
 
     @cached_property
     def tangents(self) -> FloatArray:
@@ -486,16 +486,16 @@ class Explanation:
     def held_out(self) -> Loss:
         """Held-out errors of this fit."""
         columns = np.column_stack([self.target, self.before, self.tangents])
-        return self.joint.held_out(self.joint.sampled(columns)).loss([0], range(1, columns.shape[1]))
+        return self.equations.held_out(self.equations.sampled(columns)).loss([0], range(1, columns.shape[1]))
 
     @property
     def objective(self) -> float:
         """Mean square of the residual plus the roughness penalty of the hysteresis, m^2."""
-        used, problem = self.used, self.joint.problem
+        used, problem = self.used, self.equations.problem
         rough = float(self._x @ problem.penalty(self.evidence.smoothness, problem.count) @ self._x) / problem.count
         return float(np.mean(self.residual[used] ** 2)) + rough * problem.scale**2
 
-    def refined(self, times: int) -> "Explanation":
+    def refined(self, times: int) -> "JointFit":
         """Return the fit after up to `times` Gauss-Newton steps of hysteresis and all effect parameters."""
         best = self
         for _ in range(times if self.effects else 0):
@@ -506,16 +506,16 @@ class Explanation:
                 break
         return best
 
-    def _step(self) -> "Explanation":
+    def _step(self) -> "JointFit":
         """Return the fit after one Gauss-Newton step, shortened until the objective falls; else the fit itself."""
-        change = self.joint.columns(self.before, self.tangents).fit(self.target)[1][self.before.shape[1] :]
+        change = self.equations.columns(self.before, self.tangents).fit(self.target)[1][self.before.shape[1] :]
         for share in SHARES:
             try:
                 effects = self._stepped(share * change)
             except ModelError:
                 # The step is too long: the effect parameters are invalid.
                 continue
-            stepped = Explanation(self.evidence, effects, self)
+            stepped = JointFit(self.evidence, effects, self)
             if stepped.objective < self.objective:
                 return stepped
         return self
@@ -549,7 +549,7 @@ class Explanation:
 
     def hysteresis(self) -> tuple[Hysteresis, tuple[float, ...]]:
         """Return the hysteresis with monotone branches, and its displacement at the start of each record, m."""
-        problem = replace(self.joint.problem, y=self.joint.padded(self.target - self.settling))
+        problem = replace(self.equations.problem, y=self.equations.padded(self.target - self.settling))
         x = problem.solve(self.evidence.smoothness).x
         h = problem.design.predict(x)[self.evidence.rows] * problem.scale
         starts = tuple(float(h[rows.start]) for rows in self.evidence.slices)
@@ -568,7 +568,7 @@ class Explanation:
     def _deviations(self, columns: FloatArray) -> FloatArray:
         """Return the standard deviations, shape (k,), of the gains of columns, shape (N, k), metres."""
         # Errors of neighbouring samples are correlated, so there are fewer independent errors than samples.
-        precision = self.joint.columns(columns, self.before).precision
+        precision = self.equations.columns(columns, self.before).precision
         errors = self.residual[self.evidence.used]
         size = np.sqrt(np.maximum(np.diag(precision), 1e-300))
         inverse = np.linalg.pinv(precision / np.outer(size, size), rcond=1e-12) / np.outer(size, size)
@@ -576,13 +576,13 @@ class Explanation:
         deviations: FloatArray = np.sqrt(variances * np.mean(errors**2) * alike_in_a_row(errors))
         return deviations
 
-    def smoothed(self) -> "Explanation":
+    def smoothed(self) -> "JointFit":
         """Return the fit with the smoothness of the hysteresis reselected by cross-validation, given the effects."""
-        problem = replace(self.joint.problem, y=self.joint.padded(self.target))
+        problem = replace(self.equations.problem, y=self.equations.padded(self.target))
         best = problem.smoothness_near(self.evidence.smoothness, SMOOTHNESS)
         if best == self.evidence.smoothness:
             return self
-        smoothed = Explanation(replace(self.evidence, smoothness=best), self.effects).refined(2)
+        smoothed = JointFit(replace(self.evidence, smoothness=best), self.effects).refined(2)
         # That choice is based on one division into blocks and on fixed effects; therefore compare after a refit.
         return min(self.refined(2), smoothed, key=lambda one: one.held_out.rms)
 
@@ -596,7 +596,7 @@ class Explanation:
             path = np.array([first, low, high, middle, low, middle])
             whole = Samples(path, path, np.ones(path.size, dtype=bool)).after(part.history)
             x = self._x[: self.evidence.basis.size + 1]
-            y = self.evidence.predict([whole], x)[-path.size :] * self.joint.problem.scale
+            y = self.evidence.predict([whole], x)[-path.size :] * self.equations.problem.scale
             zeros.append(0.5 * (y[3] + y[5]) + float(self.h[rows.start]) - y[0])
         return np.array(zeros)
 
@@ -604,36 +604,36 @@ class Explanation:
         """Return the effect of this name."""
         return next(effect for effect in self.effects if effect.name == name)
 
-    def adding(self, effect: Effect) -> "Explanation":
+    def adding(self, effect: Effect) -> "JointFit":
         """Return the fit with one more effect, or with more of one that is there; ModelError if it has that once."""
         more = {other.name: other.joined(effect) for other in self.effects if other.name == effect.name}
         joined = [more.get(other.name) or other for other in self.effects]
-        return Explanation(self.evidence, joined if all(more.values()) and more else [*joined, effect], self)
+        return JointFit(self.evidence, joined if all(more.values()) and more else [*joined, effect], self)
 
-    def replacing(self, name: str, effect: Effect) -> "Explanation":
+    def replacing(self, name: str, effect: Effect) -> "JointFit":
         """Return the fit with an effect in place of another one."""
-        return Explanation(self.evidence, [effect if one.name == name else one for one in self.effects], self)
+        return JointFit(self.evidence, [effect if one.name == name else one for one in self.effects], self)
 
     def predicted_with(self, effect: Effect) -> FloatArray:
         """Return the prediction, shape (N,), metres, with one more effect and with everything else unchanged."""
         return self._whole(in_order([*(one for one in self.effects if one.name != effect.name), effect]))
 
-    def only(self, names: Collection[str], *, refine: bool = True) -> "Explanation":
+    def only(self, names: Collection[str], *, refine: bool = True) -> "JointFit":
         """Return the fit with only the named effects, refitted (default) if any effect is removed."""
         kept = [effect for effect in self.effects if effect.name in names]
         if len(kept) == len(self.effects):
             return self
-        fit = Explanation(self.evidence, kept, self)
+        fit = JointFit(self.evidence, kept, self)
         return fit.refined(2) if refine else fit
 
-    def without(self, name: str) -> "Explanation":
+    def without(self, name: str) -> "JointFit":
         """Return the fit without one effect, with the others refitted."""
         return self.only([effect.name for effect in self.effects if effect.name != name])
 
-    def beside(self, columns: FloatArray) -> "Explanation":
+    def beside(self, columns: FloatArray) -> "JointFit":
         """Return the fit with additional `columns`, shape (N, k), metres, whose gains are free."""
         evidence = replace(self.evidence, beside=np.column_stack([self.evidence.beside, columns]))
-        return Explanation(evidence, self.effects, self)
+        return JointFit(evidence, self.effects, self)
 
 
 @dataclass(frozen=True)

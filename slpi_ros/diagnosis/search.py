@@ -11,7 +11,7 @@ import numpy as np
 from slpi_ros.arrays import FloatArray
 from slpi_ros.diagnosis.effect_parameters import EachRecord, free
 from slpi_ros.diagnosis.held_out import RIDGE, HeldOut, Loss
-from slpi_ros.diagnosis.joint_fit import Explanation
+from slpi_ros.diagnosis.joint_fit import JointFit
 from slpi_ros.diagnosis.prepare import drive_frequency, excited_frequency
 from slpi_ros.diagnosis.ruler import LEAST, independent_trials
 from slpi_ros.effects.base import Candidate, Effect, FitContext, is_course
@@ -36,7 +36,7 @@ def is_own(effect: Effect | type[Any]) -> bool:
     return effect.side == "record" or effect.sharing == "separate"
 
 
-def seen(now: Explanation) -> FitContext:
+def seen(now: JointFit) -> FitContext:
     """Return a joint fit as the plausibility of an effect may see it."""
     evidence = now.evidence
 
@@ -53,7 +53,7 @@ def seen(now: Explanation) -> FitContext:
     )
 
 
-def is_plausible(effect: Effect, now: Explanation) -> bool:
+def is_plausible(effect: Effect, now: JointFit) -> bool:
     """Return whether an effect of a joint fit may be what it is called."""
     if any(leaf.at_bound for leaf in effect.free_leaves()):
         return False
@@ -61,14 +61,14 @@ def is_plausible(effect: Effect, now: Explanation) -> bool:
 
 
 @dataclass(frozen=True)
-class Fitted:
+class EffectSet:
     """A set of effects with their parameters, and what it leaves."""
 
     effects: tuple[Effect, ...]
     loss: Loss
 
     @classmethod
-    def of(cls, now: Explanation) -> "Fitted":
+    def of(cls, now: JointFit) -> "EffectSet":
         """Return what is kept of a joint fit."""
         return cls(tuple(now.effects), now.held_out)
 
@@ -132,7 +132,7 @@ class Choice:
 class Library:
     """Columns of all candidates for a joint fit, with which sets are compared to first order."""
 
-    def __init__(self, now: Explanation, names: Collection[str] | None = None) -> None:
+    def __init__(self, now: JointFit, names: Collection[str] | None = None) -> None:
         self.now = now
         effects = now.effects
         contributions = [now.predicted - now.prediction_without(effect.name) for effect in effects]
@@ -144,17 +144,17 @@ class Library:
         self._own = {
             effect.name: (1 + k, [*starts[k], *range(*ends[k : k + 2].tolist())]) for k, effect in enumerate(effects)
         }
-        sampled, forms, place = [now.joint.sampled(own)], [], own.shape[1]
+        sampled, forms, place = [now.equations.sampled(own)], [], own.shape[1]
         for name, candidate, columns in self._candidates(names or EFFECTS):
             forms.append(Form(name, candidate, place, place + columns.shape[1]))
-            sampled.append(now.joint.sampled(columns))
+            sampled.append(now.equations.sampled(columns))
             place += columns.shape[1]
         self.forms = forms
         at = np.column_stack(sampled)
         size = np.linalg.norm(at, axis=0)
         size[: own.shape[1]] = 1.0
         self._size = np.where(size > 0.0, size, 1.0)
-        self.held_out: HeldOut = now.joint.held_out(at / self._size)
+        self.held_out: HeldOut = now.equations.held_out(at / self._size)
         self._known: dict[tuple[frozenset[str], frozenset[Form]], Choice] = {}
 
     def _candidates(self, names: Collection[str]) -> Iterator[tuple[str, Candidate | Effect, FloatArray]]:
@@ -242,7 +242,7 @@ class Library:
                 beam = sorted((one for one in grown.values() if one.square < least), key=lambda one: one.square)[:WIDTH]
         return sorted(found.values(), key=lambda one: one.square)
 
-    def fit(self, choice: Choice) -> Explanation | Form:
+    def fit(self, choice: Choice) -> JointFit | Form:
         """Return the joint fit with a choice at first parameters, or the form of it that is not admissible."""
         target, chosen, positive = self.columns(choice.removed, choice.forms)
         gains = self.held_out.gains(target, chosen, positive)
@@ -262,7 +262,7 @@ class Library:
         return fit
 
 
-def _forms(name: str, now: Explanation) -> Iterator[Candidate | Effect]:
+def _forms(name: str, now: JointFit) -> Iterator[Candidate | Effect]:
     """Yield the forms of an effect: with common parameters, with separate ones in each record, or both."""
     records, own = len(now.evidence.parts), is_own(EFFECTS[name])
     if not own or records == 1:
@@ -287,13 +287,13 @@ class Search:
     of those that were compared. With `names` only these effects are looked for.
     """
 
-    def __init__(self, base: Explanation, names: Sequence[str] | None = None) -> None:
+    def __init__(self, base: JointFit, names: Sequence[str] | None = None) -> None:
         self.base, self.names = base, names
         self.fixed = tuple(effect.name for effect in base.effects)
-        self.pool: dict[tuple[tuple[str, ...], int], Fitted] = {}
+        self.pool: dict[tuple[tuple[str, ...], int], EffectSet] = {}
         self.trials = 1.0
 
-    def run(self) -> Explanation:
+    def run(self) -> JointFit:
         """Return the best joint fit that was found."""
         now = self.base
         self._note(now)
@@ -311,7 +311,7 @@ class Search:
                 break
         return now
 
-    def _round(self, now: Explanation) -> Explanation:
+    def _round(self, now: JointFit) -> JointFit:
         """Return the best one of the sets in reach that are worth fitting, or `now`."""
         library, best = Library(now, self.names), now
         choices = library.choices(self.fixed)
@@ -340,13 +340,13 @@ class Search:
                 best = fit
         return best
 
-    def _note(self, now: Explanation) -> None:
-        fitted = Fitted.of(now)
+    def _note(self, now: JointFit) -> None:
+        fitted = EffectSet.of(now)
         key = fitted.names, fitted.numbers
         if key not in self.pool or fitted.loss.square < self.pool[key].loss.square:
             self.pool[key] = fitted
 
-    def sensible(self, now: Explanation) -> tuple[Explanation, list[str]]:
+    def sensible(self, now: JointFit) -> tuple[JointFit, list[str]]:
         """Return a joint fit without the effects, and parts of effects, that mean nothing, and the names of effects."""
         senseless: list[str] = []
         for name in [effect.name for effect in now.effects if effect.name not in self.fixed]:
@@ -364,7 +364,7 @@ class Search:
         return now, senseless
 
 
-def _worth_fitting(choices: Sequence[Choice], now: Explanation) -> list[Choice]:
+def _worth_fitting(choices: Sequence[Choice], now: JointFit) -> list[Choice]:
     """Return the choices with the least error of each number of forms, few forms first."""
     most = now.held_out.square - (LEAST * now.noise) ** 2
     better = [one for one in choices if one.forms and one.square < most]

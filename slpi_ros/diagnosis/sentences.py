@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from slpi_ros.diagnosis.answer import Answer, Named
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.fingerprint import Signals, half_power, hint
-from slpi_ros.diagnosis.joint_fit import Explanation
+from slpi_ros.diagnosis.joint_fit import JointFit
 from slpi_ros.diagnosis.prepare import MOST_SAMPLES, Evidence, one_speed
 from slpi_ros.diagnosis.result import AMBIGUOUS, NOTHING_FOUND, PARTLY_NAMED, UNEXPLAINED, AxisDiagnosis, Given
 from slpi_ros.diagnosis.structures import BIAS, LEVEL, NOT_CLOSING
@@ -90,7 +90,7 @@ def _of_given(given: Given, answer: Answer, before_rms: float) -> str:
     return f"The given model is off by {error} rms on this record. " if BIAS in answer.structures else ""
 
 
-def _in_model(found: AxisDiagnosis, now: Explanation) -> str:
+def _in_model(found: AxisDiagnosis, now: JointFit) -> str:
     own = [effect.name for effect in now.effects if isinstance(effect, EachRecord)]
     said = f" Not in the extended model, as it differs from record to record: {', '.join(own)}." if own else ""
     if undecided := [named.name for named in found.effects if named.alternatives and named.name not in own]:

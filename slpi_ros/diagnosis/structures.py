@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.diagnosis.joint_fit import Explanation
+from slpi_ros.diagnosis.joint_fit import JointFit
 from slpi_ros.hysteresis.reversals import monotone_runs
 
 # Defect of other kinds of hysteresis model than the loop family.
@@ -16,7 +16,7 @@ NOT_CLOSING, LEVEL = "loops that do not close", "loops that depend on level"
 FORGETS_WITHIN = (0.02, 0.05, 0.12, 0.3, 0.7)
 
 
-def _do_not_close(now: Explanation) -> FloatArray:
+def _do_not_close(now: JointFit) -> FloatArray:
     """Return columns, shape (N, k), metres, for loops that do not close: Duhem operators, as in the Bouc-Wen model."""
     # Each follows ``dz = dv - z |dv| / w`` with a memory length ``w`` (V), independent of the rate.
     span = float(np.ptp(now.evidence.v))
@@ -36,11 +36,11 @@ def _duhem(v: FloatArray, way: float) -> FloatArray:
     return z
 
 
-def _bent(now: Explanation) -> FloatArray:
+def _bent(now: JointFit) -> FloatArray:
     """Return columns, shape (N, 2), metres, for loops that depend on level: square and cube of the displacement."""
     x = now.h - now.h.mean()
     x = x / np.abs(x).max()
     return np.column_stack([x**2, x**3]) * float(np.ptp(now.h))
 
 
-STRUCTURES: Mapping[str, Callable[[Explanation], FloatArray]] = {NOT_CLOSING: _do_not_close, LEVEL: _bent}
+STRUCTURES: Mapping[str, Callable[[JointFit], FloatArray]] = {NOT_CLOSING: _do_not_close, LEVEL: _bent}

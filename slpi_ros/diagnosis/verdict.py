@@ -8,7 +8,7 @@ import numpy as np
 from slpi_ros.diagnosis.answer import Answer, Named
 from slpi_ros.diagnosis.effect_parameters import EachRecord
 from slpi_ros.diagnosis.fingerprint import Signals, fingerprint
-from slpi_ros.diagnosis.joint_fit import Explanation
+from slpi_ros.diagnosis.joint_fit import JointFit
 from slpi_ros.diagnosis.result import (
     AMBIGUOUS,
     NAMED,
@@ -99,7 +99,7 @@ def _verdict(answer: Answer, effects: tuple[NamedEffect, ...], noise_rms: float)
     return PARTLY_NAMED if more_than_noise else NAMED
 
 
-def signals_of(now: Explanation) -> list[Signals]:
+def signals_of(now: JointFit) -> list[Signals]:
     """Return the used samples of each record with what a joint fit leaves."""
     evidence = now.evidence
     records = []
@@ -110,7 +110,7 @@ def signals_of(now: Explanation) -> list[Signals]:
     return [record for record in records if record.t.size]
 
 
-def _traces(base: Explanation, now: Explanation) -> Traces:
+def _traces(base: JointFit, now: JointFit) -> Traces:
     evidence, seen = now.evidence, np.flatnonzero(now.evidence.parts[0].seen)
     parts = {effect.name: now.predicted - now.prediction_without(effect.name) for effect in now.effects}
     t, v, y, before, after = (x[seen] for x in (evidence.t, evidence.v, evidence.y, base.predicted, now.predicted))

@@ -351,7 +351,7 @@ class EffectBase(Protocol):
         return None if self.side == "record" else self  # type: ignore[return-value]
 
     @property
-    def anew(self) -> Self:
+    def without_records(self) -> Self:
         """The effect for another fit, without what it knows of the records of this one."""
         return self
 

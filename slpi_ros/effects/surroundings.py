@@ -200,7 +200,7 @@ class Surroundings(EffectBase):
         return replace(self, initial=())
 
     @property
-    def anew(self) -> "Surroundings":
+    def without_records(self) -> "Surroundings":
         """The effect without the starts of its records."""
         return self.lasting
 

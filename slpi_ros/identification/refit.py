@@ -163,8 +163,8 @@ def _refit_axis(old: AxisModel, samples: Samples, source: str) -> tuple[AxisMode
     samples = samples.after(history)
     problem = Problem.pose([samples], basis).reweighted()
     repeatability = max(old.quality.held_out_rms, white_noise(found.residual[np.isfinite(found.residual)]))
-    anew = problem.residual()[problem.weights > 0] * problem.scale
-    require_own(found.rms, _rms(anew), max(samples.spread[1], float(np.ptp(old.displacement_range))))
+    own = problem.residual()[problem.weights > 0] * problem.scale
+    require_own(found.rms, _rms(own), max(samples.spread[1], float(np.ptp(old.displacement_range))))
     otherwise = found.rms_explained > BEYOND_REPEATABILITY * repeatability
     drifted = found.gain_changed or found.width_changed or otherwise
     x = _solved(problem, x_old / problem.scale, *(CHANGED if drifted else UNCHANGED))

@@ -28,7 +28,7 @@ WORSE, WORSE_BY_NOISE, UNSURE = 1.1, 4.0, 3.0
 # from, until it is held.
 MOST_RETURNS, MOST_REFUSED = 2, 3
 # How a text begins and ends that says why learning is held.
-HELD, ANEW = "held", "forget what was learned to begin anew"
+HELD, ANEW = "held", "forget what was learned to begin again"
 # Passes after which the best one is forgotten, as the stage is another one by then.
 BEST_PASSES = 50
 # Largest part of the stroke that learning may add to the desired path, by default.
@@ -448,8 +448,8 @@ class AxisLearner:
         unknown = np.flatnonzero(~self.harmonics.phase_known[1:]) + 1
         return float(self.frequency[unknown[0] if unknown.size else -1])
 
-    def anew(self) -> "AxisLearner":
-        """Return what begins anew from the desired path."""
+    def begun_again(self) -> "AxisLearner":
+        """Return what begins again from the desired path."""
         return AxisLearner(self.axis, self.dt, self.desired, self.limit, self.voltage)
 
     def _scatter(self) -> float:
@@ -611,14 +611,14 @@ class AxisLearner:
             expected, spread = self._expected(self.path - self.desired)
             whole = float(np.sum(expected)) + self._scatter() + (spread if self.harmonics.passes else 0.0)
         if not math.isfinite(whole) or (self.best and self.best.number > self.passes[-1].number):
-            raise ModelError("its numbers do not belong together; learn the path anew")
+            raise ModelError("its numbers do not belong together; learn the path again")
 
 
 def _check_size(name: str, values: Any, size: int) -> None:
     """Raise ModelError if the last dimension of an array is of another size, or a value is not finite."""
     found = np.array(values, dtype=np.float64)
     if found.shape[-1:] != (size,) or not np.isfinite(found).all():
-        raise ModelError(f"{name} is not {size} finite numbers; learn the path anew")
+        raise ModelError(f"{name} is not {size} finite numbers; learn the path again")
 
 
 def _listed(x: FloatArray | None) -> list[float] | None:

@@ -146,8 +146,8 @@ class Learner:
         return {name: list(axis.passes) for name, axis in self.axes.items()}
 
     def forget(self) -> None:
-        """Begin anew from the desired path."""
-        self.axes = {name: axis.anew() for name, axis in self.axes.items()}
+        """Begin again from the desired path."""
+        self.axes = {name: axis.begun_again() for name, axis in self.axes.items()}
 
     def to_document(self) -> dict[str, Any]:
         """Return what was learned as a JSON document (schema ``learned``), with the identity of path and model."""
@@ -162,23 +162,23 @@ class Learner:
     def resume(self, document: Mapping[str, Any], source: str = "learned") -> list[str]:
         """Go on from a document of the same stage and path; return remarks.
 
-        Of another model, learning begins anew from the correction of the path. ModelError, which begins with `source`,
+        Of another model, learning begins again from the correction of the path. ModelError, which begins with `source`,
         if the document is not valid, or of another stage or path; then nothing of it is taken over.
         """
         validate(document, "learned", source)
         try:
             json.dumps(document, allow_nan=False)
         except ValueError:
-            raise ModelError(f"{source}: a number in it is not finite; learn the path anew") from None
+            raise ModelError(f"{source}: a number in it is not finite; learn the path again") from None
         if stage_name(document["hardware_id"]) != stage_name(self.model.hardware_id):
             raise ModelError(
                 f"{source}: learned on stage '{document['hardware_id']}', the model is of '{self.model.hardware_id}'; "
-                "learn the path of this stage anew"
+                "learn the path of this stage again"
             )
         own = path_identity(self.t, {name: axis.desired for name, axis in self.axes.items()})
         if document["path"] != own or document["axes"].keys() != self.axes.keys():
-            raise ModelError(f"{source}: learned for another path; give the file of this path, or learn it anew")
-        remarks, axes = [], {name: axis.anew() for name, axis in self.axes.items()}
+            raise ModelError(f"{source}: learned for another path; give the file of this path, or learn it again")
+        remarks, axes = [], {name: axis.begun_again() for name, axis in self.axes.items()}
         for name, axis in axes.items():
             learned = document["axes"][name]
             # A file of an earlier version tells nothing of the dynamics, or of the innovations.
@@ -189,10 +189,10 @@ class Learner:
                 raise ModelError(f"{source}: axis '{name}': {error}") from None
             except (ArithmeticError, LookupError, TypeError, ValueError) as error:
                 what = f"it has no {error}" if isinstance(error, KeyError) else "its numbers do not belong together"
-                raise ModelError(f"{source}: axis '{name}': {what}; learn the path anew") from None
+                raise ModelError(f"{source}: axis '{name}': {what}; learn the path again") from None
             if not same:
                 why = "a file of an earlier version" if learned["model"] == self._identity(name) else "another model"
-                remarks.append(f"axis '{name}': {why}; learned anew, from the correction of the path so far")
+                remarks.append(f"axis '{name}': {why}; learned again, from the correction of the path so far")
         self.axes = axes
         return remarks
 
@@ -269,7 +269,7 @@ def read_learned(path: str | os.PathLike[str]) -> dict[str, Any]:
         document = json.loads(read_input(path, MODEL_BYTES).decode())
     except (OSError, ValueError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is no JSON document"
-        raise ModelError(f"{path}: cannot read what was learned: {reason}; leave it out to learn anew") from None
+        raise ModelError(f"{path}: cannot read what was learned: {reason}; leave it out to learn again") from None
     validate(document, "learned", str(path))
     found: dict[str, Any] = document
     return found

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from slpi_ros.diagnosis.held_out import UNDETERMINED
-from slpi_ros.diagnosis.joint_fit import Joint, _thinned
+from slpi_ros.diagnosis.joint_fit import Equations, _thinned
 from slpi_ros.diagnosis.prepare import Evidence, Part
 from slpi_ros.identification.bases import SurfaceBasis
 from slpi_ros.identification.least_squares import FOLDS
@@ -47,7 +47,7 @@ def dense(joint, y, columns, kept):
 @pytest.mark.parametrize("lead", [(), (95.0, 5.0, 60.0)])
 def test_fit_is_that_of_everything_stacked(lead, records):
     said, columns = evidence(records, lead)
-    joint = Joint(said, said.v)
+    joint = Equations(said, said.v)
     x_fitted, gains = joint.columns(columns).fit(said.y)
     _, x = dense(joint, said.y, columns, np.ones(said.y.size, dtype=bool))
     np.testing.assert_allclose(gains, x[-2:], rtol=1e-5, atol=1e-9)
@@ -63,7 +63,7 @@ def losses(joint, y, columns):
 def test_errors_of_blocks_left_out_are_those_of_fits_without_them():
     said, columns = evidence()
     y = said.y + columns @ [0.3, -0.2]
-    joint = Joint(said, said.v)
+    joint = Equations(said, said.v)
     errors = np.full(y.size, np.nan)
     for rows in joint._groups[1:]:
         kept = np.ones(y.size, dtype=bool)
@@ -84,7 +84,7 @@ def test_errors_of_a_record_left_out_are_those_of_a_hysteresis_fitted_to_the_oth
         # A column of the first record alone, fitted there, a block left out.
         columns = np.column_stack([columns, np.where(np.arange(y.size) < 1500, columns[:, 0] ** 2 * 1e6, 0.0)])
         y = y + 0.4 * columns[:, 2]
-    joint = Joint(said, said.v)
+    joint = Equations(said, said.v)
     errors, groups = np.full(y.size, np.nan), iter(joint._groups)
     for record, rows in enumerate(said.slices):
         kept = np.ones(y.size, dtype=bool)
@@ -123,7 +123,7 @@ def without_hysteresis(joint, signal, kept):
 
 def test_a_hold_before_the_motion_does_not_decide_what_others_predict():
     said, _ = evidence(2, hold=9.0)
-    joint = Joint(said, said.v)
+    joint = Equations(said, said.v)
     moving = np.concatenate([part.t > 9.0 for part in said.parts])
     assert joint.predictable[moving].mean() > 0.5
 
@@ -131,7 +131,7 @@ def test_a_hold_before_the_motion_does_not_decide_what_others_predict():
 def test_gains_that_may_not_be_negative_are_not():
     said, columns = evidence()
     y = said.y + columns @ [0.3, -0.2]
-    joint = Joint(said, said.v)
+    joint = Equations(said, said.v)
     held_out = joint.held_out(joint.sampled(np.column_stack([y, columns])))
     free, bound = (held_out.gains([0], [1, 2], positive) for positive in ((), (2,)))
     np.testing.assert_allclose(free, [0.3, -0.2], atol=0.03)
@@ -142,7 +142,7 @@ def test_gains_that_may_not_be_negative_are_not():
 
 def test_precision_is_what_many_noises_show():
     said, columns = evidence()
-    joint, rng = Joint(said, said.v), np.random.default_rng(1)
+    joint, rng = Equations(said, said.v), np.random.default_rng(1)
     noise = 2e-8
     beside = joint.columns(columns)
     gains = np.array([beside.fit(said.y + noise * rng.normal(size=said.y.size))[1] for _ in range(300)])

@@ -5,10 +5,10 @@ import pytest
 from scipy.signal import lfilter, lfilter_zi
 
 from slpi_ros.diagnosis.answer import Judge, answer_of
-from slpi_ros.diagnosis.joint_fit import Explanation
+from slpi_ros.diagnosis.joint_fit import JointFit
 from slpi_ros.diagnosis.prepare import Evidence, Part
 from slpi_ros.diagnosis.ruler import beats
-from slpi_ros.diagnosis.search import Fitted, Form, Library, Search
+from slpi_ros.diagnosis.search import EffectSet, Form, Library, Search
 from slpi_ros.effects.base import Candidate
 from slpi_ros.identification.bases import SurfaceBasis
 
@@ -31,7 +31,7 @@ def fit(lag=0.0, hum=0.0, drift=0.0, records=1):
         used = np.ones(t.size, dtype=bool)
         parts.append(Part(f"record {seed}", t, v, y, used, used, used, (), {}, 0.0))
     low, high = min(part.v.min() for part in parts), max(part.v.max() for part in parts)
-    return Explanation(Evidence(tuple(parts), SurfaceBasis(np.linspace(low, high, 15)), 1e-3))
+    return JointFit(Evidence(tuple(parts), SurfaceBasis(np.linspace(low, high, 15)), 1e-3))
 
 
 def play(u, width):
@@ -55,8 +55,8 @@ def test_what_acts_in_one_block_alone_is_not_extrapolated(records, tiny):
     column = tiny * np.random.default_rng(0).standard_normal(now.t.size)
     column[3000:] = 0.0
     column[1500:1530] = 1e-8 * np.sin(np.arange(30.0))
-    own = now.joint.sampled(np.column_stack([now.target, column]))
-    assert now.joint.held_out(own).loss([0], [1]).rms == pytest.approx(now.held_out.rms, rel=0.05)
+    own = now.equations.sampled(np.column_stack([now.target, column]))
+    assert now.equations.held_out(own).loss([0], [1]).rms == pytest.approx(now.held_out.rms, rel=0.05)
 
 
 @pytest.fixture(scope="module")
@@ -88,7 +88,7 @@ def test_each_gain_is_relative_to_the_preceding_effects(both):
 
 def test_the_answer_is_in_the_pool_of_the_search_and_no_smaller_set_is_as_good(both):
     search, answer = both
-    smaller = [one for one in search.pool.values() if one.numbers < Fitted.of(answer.now).numbers]
+    smaller = [one for one in search.pool.values() if one.numbers < EffectSet.of(answer.now).numbers]
     noise = answer.now.noise
     assert smaller and all(beats(answer.now.held_out, one.loss, noise, search.trials) for one in smaller)
 

@@ -11,7 +11,7 @@ from effects.supply_sag import SupplySag
 import slpi_ros
 from slpi_ros.diagnosis.answer import answer_of
 from slpi_ros.diagnosis.effect_parameters import bounded, free, moved, names, steps
-from slpi_ros.diagnosis.joint_fit import Explanation
+from slpi_ros.diagnosis.joint_fit import JointFit
 from slpi_ros.diagnosis.prepare import evidence_of
 from slpi_ros.effects import registry
 from slpi_ros.errors import ModelError
@@ -67,7 +67,7 @@ def test_it_is_found_fitted_described_saved_and_loaded(record, tmp_path):
 
 
 def test_its_plausibility_is_asked(record, monkeypatch):
-    fit = Explanation(evidence_of([record], "x", slpi_ros.identify(record).axes["x"]))
+    fit = JointFit(evidence_of([record], "x", slpi_ros.identify(record).axes["x"]))
     (one,) = answer_of(fit, [NAME]).now.effects
     assert one.gain == pytest.approx(GAIN, rel=0.1)
     monkeypatch.setattr("effects.supply_sag.LARGEST", 1e-6)

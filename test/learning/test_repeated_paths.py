@@ -79,7 +79,7 @@ def test_another_model_and_another_stage(model, tmp_path):
     file.write_text("{")
     (found,) = RepeatedPaths(model, prefix).load()
     assert found.remarks == (
-        f"learned afresh: {file}: cannot read what was learned: it is no JSON document; leave it out to learn anew",
+        f"learned afresh: {file}: cannot read what was learned: it is no JSON document; leave it out to learn again",
     )
 
 

@@ -1,4 +1,4 @@
-"""The picture of README: a measured loop beside two models that were fitted to another record.
+"""The picture of README: a measured loop beside models that were fitted to another record.
 
     python -m benchmarks.measured.loop
 
@@ -19,7 +19,7 @@ from benchmarks.measured.scores import Tables, fitted_series, free_run
 PICTURE = ROOT / "docs" / "images" / "loop.svg"
 # README's row of the nanopositioner: fitted to 20 Hz, judged at 40 Hz; the models, with their colours.
 TASK, CYCLE_S = "ntnu2 20 Hz", 0.025
-MODELS = {"PI": "tab:orange", "SLPI, causes": "black"}
+MODELS = {"PI": "tab:orange", "generalised PI": "tab:green", "SLPI, causes": "black"}
 
 
 def draw(folder: Path, path: Path) -> None:

@@ -71,10 +71,10 @@ def readme_table(rows: Rows, manifest: Manifest, date: str, command: str) -> str
     count = max(len(row) for row in rows.values())
     said = (
         f"Rms error of the displacement predicted from voltages alone, without its mean, on data that were not fitted, "
-        f"in % of their range; {date}, `{command}`. **Bold**: the best of {count} methods, in the last column one that "
-        f"is not of this package; *equal*: not significantly worse than the best (95 %), however large the difference "
-        f"looks where a record has few cycles. A device whose motion was measured has one row: the one with the median "
-        f"ratio of *SLPI, causes* to the best other method, of two the worse one.\n\n"
+        f"in % of their range; {date}, `{command}`. **Bold**: the least of {count} methods; *as good*: no significant "
+        f"difference to it (95 %), however large it looks where a record has few cycles. One row for each device that "
+        f"moves: of its rows the one with the median ratio of *SLPI, causes* to the best other method, of two the "
+        f"worse.\n\n"
         f"{headline(rows, by_device(rows, manifest))} [All {len(rows)} rows, all methods, with intervals]"
         f"(docs/explanation/measured.md)."
     )
@@ -94,9 +94,9 @@ class Comparison:
         """Return the figures in words."""
         ties = len(self.ratios) - self.wins - self.losses
         return (
-            f"median {np.median(self.ratios):.2f}, worst {max(self.ratios):.2f} (with the mean errors "
+            f"median {np.median(self.ratios):.2f}, worst {max(self.ratios):.2f} (offset included "
             f"{np.median(self.absolute):.2f} and {max(self.absolute):.2f}); significantly less in {self.wins} rows, "
-            f"equal in {ties}, more in {self.losses}"
+            f"no different in {ties}, more in {self.losses}"
         )
 
 
@@ -205,7 +205,7 @@ def _cell(cell: Mapping[str, Any], mark: str) -> str:
     if "rms" not in cell:
         return "refused"
     figure = f"{cell['rms']:.3f}"
-    return {"*": f"**{figure}**", "=": f"*{figure}* equal"}.get(mark, figure)
+    return {"*": f"**{figure}**", "=": f"{figure} *as good*"}.get(mark, figure)
 
 
 def with_part(text: str, name: str, part: str) -> str:

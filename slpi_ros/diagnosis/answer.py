@@ -8,7 +8,7 @@ from slpi_ros.diagnosis.held_out import Loss
 from slpi_ros.diagnosis.joint_fit import JointFit
 from slpi_ros.diagnosis.prepare import one_speed
 from slpi_ros.diagnosis.ruler import EXPLAINED, beats, chance, share
-from slpi_ros.diagnosis.search import CONVERGED, MOST_EFFECTS, EffectSet, Form, Library, Search
+from slpi_ros.diagnosis.search import CONVERGED, MOST_EFFECTS, EffectSet, Form, Library, Search, is_plausible
 from slpi_ros.diagnosis.structures import STRUCTURES
 from slpi_ros.model.axis_model import ABOVE_NOISE
 
@@ -128,11 +128,16 @@ class Judge:
         single, little = len(now.evidence.parts) == 1, ABOVE_NOISE * now.noise
 
         def explains(name: str) -> bool:
+            if not is_plausible(now.effect(name), now):
+                return False
             # A free course of one record is refuted by nothing but what it leaves, and of several records fits what
             # the others have in common, too: there it has to be more than noise.
             if now.effect(name).courses and (now.held_out.rms > little if single else rest[name].rms <= little):
                 return False
-            return share(now.held_out, rest[name], self._noise) >= EXPLAINED
+            # What goes on from before the records is a course of theirs, which needs no effect.
+            begun = now.effect(name).starting(now.evidence.around, now.evidence.used)
+            without = self._without(now, name).beside(begun).held_out if begun.size else rest[name]
+            return share(now.held_out, without, self._noise) >= EXPLAINED
 
         return [name for name in rest if not explains(name)]
 

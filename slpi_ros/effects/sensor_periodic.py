@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from math import cos, pi, sin
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -33,6 +33,8 @@ SHORTEST, LONGEST, LINES, BINS = 50e-9, 0.8e-6, 4, 2**14
 ROUNDING_PERIOD = 1.3 * 12**0.5
 # Largest difference of the zeros of records, as a share of the period, for a common error.
 IN_PHASE = 0.1
+# Largest amplitude over that at which a reading belongs to two displacements.
+INVERTIBLE = 0.9
 
 # Newton's method converges quadratically once the error is small.
 _STEPS = 60
@@ -122,8 +124,12 @@ class SensorPeriodic(EffectBase):
     @classmethod
     def _of(cls, period: float, gains: FloatArray) -> "SensorPeriodic":
         amplitude, phase = amplitude_and_phase(gains)
-        # A larger amplitude would not be invertible.
-        return cls(period, min(amplitude, 0.9 * period / (2 * np.pi)), phase)
+        return cls(**cls.limited({"period": period, "amplitude": amplitude, "phase": phase}))
+
+    @classmethod
+    def limited(cls, changed: dict[str, Any]) -> dict[str, Any]:
+        """Return new parameters with an amplitude that leaves the readings invertible."""
+        return changed | {"amplitude": min(changed["amplitude"], INVERTIBLE * changed["period"] / (2 * pi))}
 
     def describe(self) -> str:
         """Describe amplitude and period."""

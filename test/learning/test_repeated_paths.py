@@ -70,7 +70,7 @@ def test_another_model_and_another_stage(model, tmp_path):
     # From the file, and from what another model has learned in this process.
     (found,), (same,) = RepeatedPaths(other, prefix).load(), RepeatedPaths(other).take_over(before)
     assert same.remarks == found.remarks and same.correction["x"] == pytest.approx(found.correction["x"], abs=1e-15)
-    assert found.remarks == ("axis 'x': another model; learned anew, from the correction of the path so far",)
+    assert found.remarks == ("axis 'x': another model; learned again, from the correction of the path so far",)
     assert np.ptp(found.correction["x"]) > 50e-9 and not found.axes
     (found,) = RepeatedPaths(replace(model, hardware_id="two"), prefix).load()
     assert not found.identity and not found.correction

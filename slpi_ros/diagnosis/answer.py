@@ -136,8 +136,8 @@ class Judge:
                 return False
             # What goes on from before the records is a course of theirs, which needs no effect.
             begun = now.effect(name).starting(now.evidence.around, now.evidence.used)
-            without = self._without(now, name).beside(begun).held_out if begun.size else rest[name]
-            return share(now.held_out, without, self._noise) >= EXPLAINED
+            others = [rest[name], *([self._without(now, name).beside(begun).held_out] if begun.size else [])]
+            return all(share(now.held_out, other, self._noise) >= EXPLAINED for other in others)
 
         return [name for name in rest if not explains(name)]
 
@@ -209,9 +209,8 @@ class Judge:
             if numbers <= own or alone:
                 as_good = as_good or (alone and self._beats(fit.held_out, rest.held_out))
                 rivals.append(Rival(label, fit.held_out, as_good))
-        return min(better, key=lambda fit: (EffectSet.of(fit).numbers, fit.held_out.square), default=None), tuple(
-            rivals
-        )
+        better.sort(key=lambda fit: (EffectSet.of(fit).numbers, fit.held_out.square))
+        return next((fit for fit in better if not self._senseless(fit)), None), tuple(rivals)
 
     def _named(self, now: JointFit, rivals: dict[str, tuple[Rival, ...]]) -> tuple[Named, ...]:
         """Return the effects, each with its gain when added to the preceding ones, the largest gain first."""

@@ -129,7 +129,7 @@ def headline(rows: Rows, shown: Iterable[str]) -> str:
         f"for each row: {compared(rows)}. In the rows shown here the median is {few:.2f}. Over that of PI: "
         f"{compared(rows, ['PI'])}. Over that of PI with a lag: {compared(rows, ['PI, lag'])}. The causes make SLPI "
         f"significantly better in {causes.wins} rows and worse in {causes.losses}, at worst by a factor of "
-        f"{max(causes.ratios):.2f}. A fit takes {fit:.0f} s on one core, a sample {sample:.1f} µs (medians)."
+        f"{max(causes.ratios):.2f}. A fit takes {fit:.0f} s on one core, a sample {sample:.2f} µs (medians)."
     )
 
 

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from math import inf
 
 from slpi_ros.diagnosis.effect_parameters import free
 from slpi_ros.diagnosis.held_out import Loss
@@ -181,18 +182,16 @@ class Judge:
         # With the parameters beside the effect, which are not those without it.
         library = Library(now.only({other.name for other in now.effects} - {name}, refine=False), self._search.names)
         present = {other.name for other in rest.effects} | (set() if effect.keys else {name})
-        singles = library.screened((), (), present)
-        if not (alone or unproved):
-            singles = [form for form in singles if form.numbers <= free(effect).size]
+        singles, most = library.screened((), (), present), inf if alone or unproved else free(effect).size
         choices = sorted((library.choice(frozenset(), (form,)) for form in singles), key=lambda one: one.square)
         found, tried = list[tuple[str, JointFit]](), dict[str, int]()
         for choice in [one for one in choices if one.square < rest.held_out.square]:
             (form,) = choice.forms
+            first = library.fit(choice)
+            if isinstance(first, Form) or free(first.effect(form.name)).size > most:
+                continue
             tried[form.name] = tried.get(form.name, 0) + 1
             if len(tried) > RIVALS or tried[form.name] > 1 + len(effect.keys):
-                continue
-            first = library.fit(choice)
-            if isinstance(first, Form):
                 continue
             fit, senseless = self._search.sensible(first.refined(CONVERGED))
             if senseless or fit.effect(form.name).keys == effect.keys != ():

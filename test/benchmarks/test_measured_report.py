@@ -139,6 +139,5 @@ def test_no_kept_method_loses_to_a_line_on_its_own_data():
     assert losing({method.name for method in METHODS} - {"SLPI, causes"}) == []
 
 
-@pytest.mark.xfail(reason="of the mirror's sines a period of the sensor that is longer than the stroke is named")
 def test_no_causes_lose_to_a_line_on_their_own_data():
     assert losing({"SLPI, causes"}) == []

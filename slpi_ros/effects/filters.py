@@ -114,8 +114,8 @@ class Mode:
     """Second-order mode ``y'' + 2 z w y' + w^2 y = w^2 h``, ``w = 2 pi frequency``."""
 
     frequency: float = parameter("Hz", "frequency", 1e-3, 1e7, fit=Fit("relative", least=1e-3))
-    # Above 1 it is two lags.
-    damping: float = parameter("", "damping ratio", 1e-6, 2, fit=Fit("relative", least=1e-3, most=2.0))
+    # Above 1 it is two lags, at 2 nearly one, behind the hysteresis, which has no number of its own.
+    damping: float = parameter("", "damping ratio", 1e-6, 2, fit=Fit("relative", least=1e-3, most=2.0, stays=2.0))
     gain: float = parameter(
         "", "share of the static displacement; at most 1 in sum", 0, 1, default=1.0, required=True,
         fit=Fit("linear", 1e-5, LEAST_GAIN, 1.0, size=True, stays=1.0),

@@ -417,11 +417,13 @@ class Resonance(EffectBase):
         return replace(self, modes=tuple(modes))
 
     def describe(self) -> str:
-        """Describe frequency, damping and share of each mode."""
-        parts = (f"{one.frequency:.4g} Hz (damping {one.damping:.3g}, share {one.gain:.3g})" for one in self.modes)
+        """Describe frequency, damping and share of each mode; of an overdamped one its two time constants."""
         rings = any(mode.damping < 1 / sqrt(2) for mode in self.modes)
         does = "rings after reversals, at" if rings else "follows late, by damped modes of"
-        return f"the stage {does} {' and '.join(parts)}"
+        told = f"the stage {does} {' and '.join(_described(mode) for mode in self.modes)}"
+        if all(mode.damping >= 1.0 for mode in self.modes):
+            told += "; so does a sensor that lags: give its time constant (`--sensor-lag`) if it is known"
+        return told
 
     def laws(self) -> Mapping[str, Any]:
         """Return modes, share beside them and factors for the compiled inverse."""
@@ -431,6 +433,14 @@ class Resonance(EffectBase):
     def streaming(self) -> StreamingResonance:
         """Return the streaming modes."""
         return StreamingResonance(self)
+
+
+def _described(mode: Mode) -> str:
+    told = f"damping {mode.damping:.3g}, share {mode.gain:.3g}"
+    if mode.damping > 1.0:
+        slow = 1.0 / mode.decay
+        told += f", as lags of {slow * 1e3:.3g} and {1e3 / (slow * mode.omega**2):.2g} ms behind the hysteresis"
+    return f"{mode.frequency:.4g} Hz ({told})"
 
 
 def _within(modes: Sequence[Mode]) -> tuple[Mode, ...]:

@@ -78,3 +78,22 @@ def test_a_well_damped_mode_is_found_from_two_speeds(damping):
     (mode,) = found.effects[0].effect.modes
     assert mode.frequency == pytest.approx(6.5, rel=0.05) and mode.damping == pytest.approx(damping, rel=0.05)
     assert found.after_rms < 1.5 * noise
+
+
+@pytest.mark.parametrize("lag", [0.06, pytest.param(0.04, marks=pytest.mark.long)])
+def test_a_lag_behind_the_hysteresis_is_an_overdamped_mode_and_carries_over(lag):
+    """As of a sensor that is late."""
+    noise = 8e-9
+    (t, v, y), (other_t, other_v, other_y) = (
+        (t, v, x[0] + lsim(([1.0], [lag, 1.0]), x - x[0], t)[1])
+        for t, v, x in (moved(40.0, 200.0, 1), moved(20.0, 200.0, 2))
+    )
+    record = record_of(t, v, y, noise)
+    diagnosis = slpi_ros.diagnose(record, slpi_ros.identify(record))
+    found = diagnosis.axes["x"]
+    assert found.verdict == "named" and [one.name for one in found.effects] == ["resonance"]
+    (mode,) = found.effects[0].effect.modes
+    assert mode.damping > 1.5 and mode.lag == pytest.approx(lag, rel=0.1)
+    assert found.after_rms < 1.5 * noise
+    error = diagnosis.extended.axes["x"].simulate(other_t, other_v) - other_y
+    assert np.std(error) < 1.5 * noise

@@ -39,7 +39,7 @@ class Lag(EffectBase):
     name: ClassVar[str] = "lag"
     acts_on: ClassVar[Signal] = "voltage"
     side: ClassVar[Side] = "stage"
-    what: ClassVar[str] = "first-order lag of the amplifier or the sensor"
+    what: ClassVar[str] = "first-order lag of the voltage, as of an amplifier, before the hysteresis"
     compensated: ClassVar[str] = "yes"
     time_shift: ClassVar[TimeShift] = "only"
     dynamic: ClassVar[bool] = True

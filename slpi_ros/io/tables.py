@@ -96,7 +96,7 @@ def import_with_summary(path: str | os.PathLike[str], options: ColumnOptions) ->
     # Of a sampling period in the place of times there is one value.
     choice = choose_columns(table.columns, options, str(path), table.read, period=bool(period))
     wanted = [*(column.name for column in choice.columns()), *choice.quantities]
-    said = []
+    first, said = list[str](), list[str]()
     if choice.time and options.sample_period is None and (single := table.single(choice.time.name)) is not None:
         period, choice = single * choice.time.scale, replace(choice, time=None)
         wanted.pop(0)
@@ -113,6 +113,8 @@ def import_with_summary(path: str | os.PathLike[str], options: ColumnOptions) ->
         if table.holds_dates(time.name):
             time, seconds = replace(time, assumed=False), values[time.name]
             said.append(f"time: '{time.name}' in seconds from its first row on")
+        else:
+            first.append(f"time: column '{time.name}' {'taken as' if time.assumed else 'in'} {time.unit}")
         choice = replace(choice, time=time)
         time_ns = _nanoseconds(seconds, time.name, table)
         if time_ns[0] == 0 and seconds[0] > 0.0:
@@ -134,7 +136,7 @@ def import_with_summary(path: str | os.PathLike[str], options: ColumnOptions) ->
     if table.left_out:
         said.append(f"left out, no columns of numbers: {joined(table.left_out)}")
     desired = {axis: _si(values, column) for axis, column in choice.desired.items()}
-    return Imported(record, desired, (*_summary(record, desired, choice), *said))
+    return Imported(record, desired, (*first, *_summary(record, desired, choice), *said))
 
 
 def _in_seconds(column: Column, values: FloatArray) -> tuple[Column, FloatArray]:
@@ -184,9 +186,7 @@ def _si(values: Mapping[str, FloatArray], column: Column) -> FloatArray:
 
 
 def _summary(record: Record, desired: Mapping[str, FloatArray], choice: ColumnChoice) -> Iterable[str]:
-    """Yield a line for each axis, one for time if its unit was assumed, and one for each desired column left out."""
-    if choice.time and choice.time.assumed:
-        yield f"time: column '{choice.time.name}' taken as {choice.time.unit}"
+    """Yield a line for each axis and quantity, and one for what is left out."""
     for axis in record.axes:
         voltage = _column_summary(choice.voltage[axis], record.voltage[axis], "V")
         displacement = _column_summary(choice.displacement[axis], record.displacement[axis] * 1e6, "µm")

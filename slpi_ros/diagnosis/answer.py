@@ -143,10 +143,31 @@ class Judge:
         return [name for name in rest if not explains(name)]
 
     def _meaningful(self, now: JointFit) -> JointFit:
-        """Return a joint fit without what is senseless, first that without which the rest predicts best."""
+        """Return a joint fit without what is senseless, first that without which the rest predicts best.
+
+        Or the best of the sets that were tried, if all of it makes sense and it predicts better than what is left.
+        """
         while found := self._senseless(now):
             now = min((self._without(now, name) for name in found), key=lambda fit: fit.held_out.square)
+        for fitted in sorted(self._search.pool.values(), key=lambda one: one.loss.square):
+            if not self._beats(fitted.loss, now.held_out):
+                break
+            if self._may_make_sense(fitted):
+                other = self._rebuilt(fitted)
+                if self._beats(other.held_out, now.held_out) and not self._senseless(other):
+                    return other
         return now
+
+    def _may_make_sense(self, fitted: EffectSet) -> bool:
+        """Return whether each effect of a set explains enough, as far as the sets without it were tried."""
+        least = {one.names: one.loss for one in sorted(self._search.pool.values(), key=lambda one: -one.loss.square)}
+        for name in {*fitted.names} - {*self._search.fixed}:
+            names = list(fitted.names)
+            names.remove(name)
+            rest = least.get(tuple(names))
+            if rest is None or share(fitted.loss, rest, self._noise) < EXPLAINED:
+                return False
+        return True
 
     def _needed(self, now: JointFit, best: JointFit) -> JointFit:
         """Return a joint fit without the effects that it, or the best one, does not need."""

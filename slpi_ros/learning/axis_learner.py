@@ -3,17 +3,18 @@
 import hashlib
 import math
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import ModelError, length
-from slpi_ros.learning.dynamics import Dynamics, Measured, Pass
+from slpi_ros.learning.dynamics import PASS_ARRAYS, Dynamics, Measured, Pass
 from slpi_ros.learning.first_guess import amplification, first_guess, known_modes, ringing
-from slpi_ros.learning.harmonics import ComplexArray, Harmonics
+from slpi_ros.learning.harmonics import HARMONICS_ARRAYS, ComplexArray, Harmonics
 from slpi_ros.learning.passes import Judged, agreed, held_back, judge
+from slpi_ros.learning.saved import Arrays, read, saved
 from slpi_ros.learning.spectrum import PathSpectrum
 from slpi_ros.model.axis_model import AxisModel
 
@@ -61,6 +62,16 @@ EXCUSED = 4
 # Share of a larger error that the answer to what was changed has at least, if it is to be blamed.
 BLAMED = 0.5
 
+# What is saved of an axis and of its best pass.
+ARRAYS: Arrays = {
+    **dict.fromkeys(("correction", "last", "before", "lead_in"), (float, ("path",))), "deviating": (bool, ("path",))
+}  # fmt: skip
+FIGURES = (
+    "gain", "held", "returns", "returned", "refused", "record", "settling", "worst", "offset", "clipped", "hashes",
+)  # fmt: skip
+BEST_ARRAYS: Arrays = dict.fromkeys(("correction", "reading"), (float, ("path",)))
+BEST_FIGURES = ("number", "power")
+
 
 @dataclass(frozen=True)
 class PassReport:
@@ -87,12 +98,12 @@ class PassReport:
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> "PassReport":
         """Return the report of a document."""
-        known = {one.name: document[one.name] for one in fields(cls)}
+        known: dict[str, Any] = {one.name: document[one.name] for one in fields(cls)}
         return cls(**known | {name: math.nan for name in ("error", "absolute") if known[name] is None})
 
     def to_document(self) -> dict[str, Any]:
         """Return the report as a part of a document; null for errors without a reading."""
-        return {name: None if value != value else value for name, value in asdict(self).items()}
+        return saved(self, {}, [one.name for one in fields(self)])
 
 
 @dataclass(frozen=True)
@@ -119,24 +130,24 @@ class AxisLearner:
         self.gain, self.held, self.returns, self.refused = GAIN, "", 0, 0
         self.record = math.inf  # m^2, least mean square error of a pass so far
         self.best: _Best | None = None
-        self._deviating: Mask | None = None
-        self._last = np.zeros(desired.size)  # correction of the pass before that was learned from
-        self._before = np.zeros(desired.size)  # correction at the end of the pass before
-        self._offset: float | None = None
-        self._hashes: list[str] = []
-        self._clipped = self._told = ""
+        self.deviating: Mask | None = None
+        self.last = np.zeros(desired.size)  # correction of the pass before that was learned from
+        self.before = np.zeros(desired.size)  # correction at the end of the pass before
+        self.offset: float | None = None
+        self.hashes: list[str] = []
+        self.clipped = self._told = ""
         modes, duration = ringing(axis), desired.size * dt
         slowest = max((ONSET_PERIODS / hertz for hertz, _ in modes), default=0.0)
         rising = max(1.0, min(ONSET * desired.size, slowest / dt))
         longest = max((time for _, time in modes), default=0.0) if self.spectrum.closed else 0.0
         self._unchanged = int(np.clip(math.ceil(RUNG_UP * longest / duration) + 1, 2, MOST_UNCHANGED))
         self._onset = 0.5 - 0.5 * np.cos(np.pi * np.minimum((np.arange(desired.size) + (rising == 1.0)) / rising, 1.0))
-        self._lead_in: FloatArray | None = None
-        self._returned = 0  # passes of the best path again, until it has settled
-        self._settling = math.inf  # m^2, mean square error of the pass before
-        self._worst = 0.0  # m^2, largest mean square error of a pass from which learning went back
+        self.lead_in: FloatArray | None = None
+        self.returned = 0  # passes of the best path again, until it has settled
+        self.settling = math.inf  # m^2, mean square error of the pass before
+        self.worst = 0.0  # m^2, largest mean square error of a pass from which learning went back
         self._history: list[Pass] = []
-        self._undisturbed: Pass | None = None  # the second pass, from which on the path is changed
+        self.undisturbed: Pass | None = None  # the second pass, from which on the path is changed
         noise = np.full(self.frequency.size, self.spectrum.size * max(axis.quality.floor_rms, 1e-12) ** 2)
         amplified = amplification(axis, self.frequency)
         self.harmonics = Harmonics.first(*first_guess(axis, dt, self.frequency), noise, amplified)
@@ -150,7 +161,7 @@ class AxisLearner:
         """The desired path of the next pass, (N,), metres: a change of `aim` comes in without a jump."""
         correction = self.correction
         if self.spectrum.closed:
-            correction = self._before + self._onset * (correction - self._before)
+            correction = self.before + self._onset * (correction - self.before)
         return self._within_range(correction)
 
     @property
@@ -185,11 +196,11 @@ class AxisLearner:
         """
         if followed is not None and not np.allclose(followed, self.path, rtol=0.0, atol=SAME_PATH):
             if self.is_followed_by(followed):
-                self.correction = self._before = followed - self.desired
+                self.correction = self.before = followed - self.desired
             else:
                 unusable = unusable or "what was asked of the compensator is another path"
         commanded = self.path - self.desired
-        self._before = self.correction
+        self.before = self.correction
         seen = (
             self.axis.correct(np.arange(measured.size, dtype=np.float64) * self.dt, measured)
             if self.axis.corrects
@@ -201,13 +212,13 @@ class AxisLearner:
         expected, spread = self._expected(commanded)
         floor = math.sqrt(self.spectrum.power(np.full(self.frequency.size, self.harmonics.noise.min())))
         error = next((one.error for one in reversed(self.passes) if one.learned), math.inf)
-        judged = judge(seen, expected, spread, floor, self._deviating, error)
-        if self._lead_in is not None and not judged.reason:
-            judged = agreed(self._lead_in, judged, self.desired, floor)
+        judged = judge(seen, expected, spread, floor, self.deviating, error)
+        if self.lead_in is not None and not judged.reason:
+            judged = agreed(self.lead_in, judged, self.desired, floor)
         # What a limit held back, or was not used for another reason, tells nothing of the sensor.
         known = unusable or self._replayed(measured, commanded)
         if not known and voltage is not None and (known := held_back(voltage, self.voltage)):
-            self._clipped = "voltage range"
+            self.clipped = "voltage range"
         reason = known or judged.reason
         offset, drift = self._offset_and_drift(judged, expected, first=first)
         clean = judged.measured - offset - drift * (np.arange(measured.size) / measured.size - 0.5)
@@ -216,10 +227,10 @@ class AxisLearner:
         rms, absolute = (float(np.sqrt(np.mean(x**2))) if x.size else math.nan for x in (rest, whole))
         self._remember(commanded, None if reason else clean)
         if reason:
-            self._refuse(reason, new=bool((commanded != self._last).any()), answered=not known)
+            self._refuse(reason, new=bool((commanded != self.last).any()), answered=not known)
         else:
             self._learn(commanded, clean, judged, rms)
-            self._offset = offset
+            self.offset = offset
         report = PassReport(
             len(self.passes) + 1, rms, absolute, offset, drift, int(np.count_nonzero(judged.bumps)), not reason,
             reason or self._told, self.held or (self.limited_by(drift) if self.passes else NOT_YET), self.bandwidth,
@@ -236,11 +247,11 @@ class AxisLearner:
         whole, correction = self.spectrum.whole, self.spectrum.of(self.correction)
         following = [*self._history, Pass(whole(commanded), None)]
         transient = self.dynamics.transient(following, whole(self.correction))
-        change = np.abs(self.spectrum.of(commanded - self._last)) ** 2
+        change = np.abs(self.spectrum.of(commanded - self.last)) ** 2
         spread = power(harmonics.variance(correction) + harmonics.noise) + ANSWER**2 * power(change)
         # What is transient is expected with a doubt of its own size; and the first passes have not settled.
         spread += power(np.abs(transient) ** 2)
-        if harmonics.passes <= SETTLING or self._returned:
+        if harmonics.passes <= SETTLING or self.returned:
             spread += next((one.error for one in reversed(self.passes) if one.learned), 0.0) ** 2
         return self.spectrum.signal(harmonics.expected(correction) + transient), math.sqrt(spread)
 
@@ -254,13 +265,13 @@ class AxisLearner:
 
     def _learn(self, commanded: FloatArray, clean: FloatArray, judged: Judged, rms: float) -> None:
         self._told, self.refused = "", 0
-        if self._lead_in is None and not self.passes:
+        if self.lead_in is None and not self.passes:
             # The first pass comes from rest, and nothing was there to compare it with: no step is made for it.
-            self._lead_in, self._deviating = clean, judged.deviating
+            self.lead_in, self.deviating = clean, judged.deviating
             self._told = "the first pass: compared with the next"
             return
-        self._lead_in = None
-        self._deviating, self._last = judged.deviating, commanded
+        self.lead_in = None
+        self.deviating, self.last = judged.deviating, commanded
         steady, unsure = self._estimate(clean)
         self._release(rms)
         if len(self.passes) + 1 < self._unchanged:
@@ -278,9 +289,9 @@ class AxisLearner:
         number, power, best = len(self.passes) + 1, max(steady, rms**2), self.best
         if best is not None and number - best.number > BEST_PASSES:
             best = None
-        if best is not None and self._returned:
+        if best is not None and self.returned:
             return self._settled_again(best, clean, rms**2)
-        self._returned = 0
+        self.returned = 0
         if best is None or power < best.power:
             if power < self.record - self._scatter():
                 self.returns, self.gain = 0, min(GROWING * self.gain, GAIN)
@@ -303,12 +314,12 @@ class AxisLearner:
 
     def _settled_again(self, best: _Best, clean: FloatArray, power: float) -> bool:
         """Judge the best path once more: its error was lucky, or what has come between is still settling."""
-        falling, self._settling = power < FALLING * self._settling, power
-        self._returned += 1
-        if falling and self._returned <= MOST_SETTLING:
+        falling, self.settling = power < FALLING * self.settling, power
+        self.returned += 1
+        if falling and self.returned <= MOST_SETTLING:
             self._told = "its changes are still settling"
             return False
-        self._returned = 0
+        self.returned = 0
         self.best = replace(best, power=power, reading=clean)
         if power > self._harm + self._scatter():
             self._give_up()
@@ -321,8 +332,8 @@ class AxisLearner:
         A mode near a harmonic of the path takes some passes to ring up: the first ones were better than any can be.
         """
         at_first = self.returns >= MOST_RETURNS and np.array_equal(self.correction, self._start)
-        if self.held and at_first and rms**2 > self._worst + self._scatter():
-            self.held, self.returns, self.best, self.record, self._returned = "", 0, None, math.inf, 0
+        if self.held and at_first and rms**2 > self.worst + self._scatter():
+            self.held, self.returns, self.best, self.record, self.returned = "", 0, None, math.inf, 0
 
     def _give_up(self) -> None:
         """Follow the path as it was at first: nothing that was learned is better."""
@@ -343,9 +354,7 @@ class AxisLearner:
     def _start(self) -> FloatArray:
         """Correction (m, (N,)) before anything was learned."""
         return (
-            np.zeros(self.desired.size)
-            if self._undisturbed is None
-            else self._undisturbed.commanded[: self.desired.size]
+            np.zeros(self.desired.size) if self.undisturbed is None else self.undisturbed.commanded[: self.desired.size]
         )
 
     @property
@@ -359,9 +368,9 @@ class AxisLearner:
         Return its mean square error without what is transient, and the mean variance of that (m^2).
         """
         h, seen, correction = self.harmonics, self.spectrum.of(clean), self.spectrum.of(self.correction)
-        if self._undisturbed is None:
-            self._undisturbed = self._history[-1]
-        begun = self._undisturbed
+        if self.undisturbed is None:
+            self.undisturbed = self._history[-1]
+        begun = self.undisturbed
         path = self.wanted + np.fft.rfft(begun.commanded)
         rest = h.of_hysteresis(path)
         aim = self.spectrum.whole(self.correction)
@@ -387,14 +396,14 @@ class AxisLearner:
         inside = np.clip(self.desired + allowed, min(low, self.desired.min()), max(high, self.desired.max()))
         reached = inside - self.desired
         beyond = np.abs(reached - allowed) > 1e-12
-        self._clipped = "learn_limit" if (allowed != wanted).any() else "voltage range" if beyond.any() else ""
+        self.clipped = "learn_limit" if (allowed != wanted).any() else "voltage range" if beyond.any() else ""
         self.correction = reached
 
     def _return(self, why: str, rms: float) -> None:
         """Go back to the best pass with half the gain; the second time without a better one since, hold."""
         assert self.best is not None
         self.correction = self.best.correction
-        self._returned, self._settling, self._worst = 1, rms**2, max(self._worst, rms**2)
+        self.returned, self.settling, self.worst = 1, rms**2, max(self.worst, rms**2)
         # What was learned of the last pass is not to make a riddle of the next one.
         self.harmonics = self.harmonics.at(self.spectrum.of(self.best.correction), self.spectrum.of(self.best.reading))
         self._told = f"{why}; back to the best, at half the gain"
@@ -415,7 +424,7 @@ class AxisLearner:
         self._told = reason
         self.refused += 1
         if self.best is not None and (new or self.refused >= MOST_REFUSED):
-            self.correction, self._returned, self._settling = self.best.correction, 1, math.inf
+            self.correction, self.returned, self.settling = self.best.correction, 1, math.inf
             if answered:
                 self._blame_change(f"{reason}, after a change")
         if self.refused >= MOST_REFUSED:
@@ -424,8 +433,8 @@ class AxisLearner:
 
     def limited_by(self, drift: float) -> str:
         """Return what keeps the error where it is: noise, bandwidth, learn_limit, voltage range, drift, or learning."""
-        if self._clipped:
-            return self._clipped
+        if self.clipped:
+            return self.clipped
         left, harmonics = self.left, self.harmonics
         sure = np.abs(left) ** 2 > CLEAR**2 * (harmonics.variance(self.spectrum.of(self.correction)) + harmonics.noise)
         known = harmonics.phase_known
@@ -467,11 +476,11 @@ class AxisLearner:
         if not known.any():
             return 0.0, 0.0
         offset = float(np.mean((judged.measured - self.desired)[known]))
-        if first or self._offset is None:
+        if first or self.offset is None:
             return offset, 0.0
         shares = np.linspace(-0.5, 0.5, known.size)[known]
         slope = float(np.polynomial.polynomial.polyfit(shares, (judged.measured - expected)[known], 1)[1])
-        moved = offset - self._offset
+        moved = offset - self.offset
         return offset, math.copysign(min(abs(slope), abs(moved)), moved) if slope * moved > 0.0 else 0.0
 
     def _replayed(self, measured: FloatArray, commanded: FloatArray) -> str:
@@ -480,158 +489,56 @@ class AxisLearner:
             return ""
         known = hashlib.sha256(np.ascontiguousarray(measured).tobytes()).hexdigest()
         path = hashlib.sha256(commanded.tobytes()).hexdigest()
-        earlier = [each.split(":")[1] for each in self._hashes if each.startswith(known)]
-        self._hashes = [*self._hashes, f"{known}:{path}"][-KEPT_HASHES:]
+        earlier = [each.split(":")[1] for each in self.hashes if each.startswith(known)]
+        self.hashes = [*self.hashes, f"{known}:{path}"][-KEPT_HASHES:]
         # Steps of the sensor that are larger than its noise and than the change of the path hide the change.
         steps = np.diff(np.unique(measured[np.isfinite(measured)]))
         step = float(steps.min()) if steps.size else 0.0
-        hidden = step > max(self.noise, float(np.abs(commanded - self._last).max()))
+        hidden = step > max(self.noise, float(np.abs(commanded - self.last).max()))
         if any(each != path for each in earlier) and not hidden:
             return "every reading is that of an earlier pass: the sensor's data are replayed"
         return ""
 
     def to_document(self) -> dict[str, Any]:
         """Return what was learned as a part of a document, metres and seconds."""
-        h = self.harmonics
         return {
             "desired_m": self.desired.tolist(),
-            "correction_m": self.correction.tolist(),
-            "last_correction_m": self._last.tolist(),
-            "before_m": self._before.tolist(),
-            "clipped": self._clipped,
-            "lead_in_m": _listed(self._lead_in),
-            "undisturbed": self._undisturbed and self._undisturbed.to_document(),
-            "history": [one.to_document() for one in self._history],
+            **saved(self, ARRAYS, FIGURES),
+            "best": self.best and saved(self.best, BEST_ARRAYS, BEST_FIGURES),
+            "undisturbed": self.undisturbed and saved(self.undisturbed, PASS_ARRAYS),
+            "history": [saved(one, PASS_ARRAYS) for one in self._history],
             "dynamics": self.dynamics.to_document(),
-            "returned": self._returned,
-            "worst_m2": self._worst,
-            "settling_m2": self._settling if math.isfinite(self._settling) else None,
-            "record_m2": self.record if math.isfinite(self.record) else None,
-            "learn_limit_m": self.limit,
-            "gain": self.gain,
-            "held": self.held,
-            "returns": self.returns,
-            "refused": self.refused,
-            "offset_m": self._offset,
-            "deviating": None if self._deviating is None else np.flatnonzero(self._deviating).tolist(),
-            "best": self.best
-            and {
-                "number": self.best.number,
-                "power_m2": self.best.power,
-                "correction_m": self.best.correction.tolist(),
-                "reading_m": self.best.reading.tolist(),
-            },
-            "hashes": self._hashes,
-            "harmonics": {
-                "gain": _pairs(h.gain),
-                "gain_variance": h.gain_variance.tolist(),
-                "without_m": _pairs(h.without),
-                "without_variance_m2": h.without_variance.tolist() if h.passes else [],
-                "covariance_m": _pairs(h.covariance),
-                "noise_m2": h.noise.tolist(),
-                "answered_m": _pairs(h.answered),
-                "scatter": h.scatter.tolist(),
-                "misfit": h.misfit.tolist(),
-                "innovation": _pairs(h.innovation),
-                "innovation_product": h.innovation_product.tolist(),
-                "innovation_square": h.innovation_square.tolist(),
-                "changed": h.changed.tolist(),
-                "answers": _pairs(h.answers),
-                "passes": h.passes,
-            },
+            "harmonics": saved(self.harmonics, HARMONICS_ARRAYS, ("passes",)) if self.harmonics.passes else None,
             "passes": [one.to_document() for one in self.passes],
         }
-
-    def _check_sizes(self, document: Mapping[str, Any]) -> None:
-        """Raise ModelError if an array of a document is not one of this path."""
-        n, numbers, best = self.desired.size, document["harmonics"], document["best"] or {}
-        arrays = [(name, values, self.harmonics.noise.size) for name, values in numbers.items() if name != "passes"]
-        if not numbers["passes"]:
-            arrays = [one for one in arrays if one[0] != "without_variance_m2"]
-        arrays += [(name, document[name], n) for name in ("last_correction_m", "before_m", "lead_in_m")]
-        arrays += [(name, best[name], n) for name in best if name in ("correction_m", "reading_m")]
-        passes = [*document["history"], *([document["undisturbed"]] if document["undisturbed"] else [])]
-        arrays += [(name, values, self.spectrum.size) for one in passes for name, values in one.items()]
-        for name, values, size in arrays:
-            if values is not None:
-                _check_size(name, values, size)
 
     def resume(self, document: Mapping[str, Any], *, same_model: bool) -> None:
         """Go on from a document of the same path; of another model, only the correction of the path is taken over.
 
         ModelError if parts of the document are of another size or do not belong together.
         """
-        _check_size("correction_m", document["correction_m"], self.desired.size)
-        if same_model:
-            self._check_sizes(document)
-        self.correction = self._last = np.clip(document["correction_m"], -self.limit, self.limit)
-        self._before = self._last if not same_model else np.clip(document["before_m"], -self.limit, self.limit)
+        sizes: dict[str | int, int] = {
+            "path": self.desired.size, "period": self.spectrum.size, "harmonics": self.frequency.size
+        }  # fmt: skip
         if not same_model:
+            found = read(document, {"correction": ARRAYS["correction"]}, sizes)
+            self.correction = self.last = self.before = np.clip(found["correction"], -self.limit, self.limit)
             return
-        numbers, h = document["harmonics"], self.harmonics
-        self._clipped = document["clipped"]
-        self._last, self._lead_in = np.array(document["last_correction_m"]), _array(document["lead_in_m"])
-        self._history = [Pass.of(one) for one in document["history"]]
-        self._undisturbed = document["undisturbed"] and Pass.of(document["undisturbed"])
+        for name, value in read(document, ARRAYS, sizes, FIGURES).items():
+            setattr(self, name, value)
+        for name in ("correction", "before"):
+            setattr(self, name, np.clip(getattr(self, name), -self.limit, self.limit))
+        self.record, self.settling = (math.inf if one is None else one for one in (self.record, self.settling))
+        best, undisturbed, harmonics = (document[name] for name in ("best", "undisturbed", "harmonics"))
+        self.best = best and _Best(**read(best, BEST_ARRAYS, sizes, BEST_FIGURES))
+        self.undisturbed = undisturbed and Pass(**read(undisturbed, PASS_ARRAYS, sizes))
+        self._history = [Pass(**read(one, PASS_ARRAYS, sizes)) for one in document["history"]]
         self.dynamics.resume(document["dynamics"])
-        self._returned = document["returned"]
-        self._settling = math.inf if document["settling_m2"] is None else document["settling_m2"]
-        self._worst = document["worst_m2"]
-        self.record = math.inf if document["record_m2"] is None else document["record_m2"]
-        self.gain, self.held = document["gain"], document["held"]
-        self.returns, self.refused, self._offset = document["returns"], document["refused"], document["offset_m"]
-        if document["deviating"] is not None:
-            deviating = np.array(document["deviating"], dtype=np.intp)
-            self._deviating = np.isin(np.arange(self.desired.size), deviating)
-        if best := document["best"]:
-            self.best = _Best(
-                best["number"], best["power_m2"], np.array(best["correction_m"]), np.array(best["reading_m"])
-            )
-        self._hashes = list(document["hashes"])
+        if harmonics:
+            self.harmonics = replace(self.harmonics, **read(harmonics, HARMONICS_ARRAYS, sizes, ("passes",)))
         self.passes = [PassReport.of(one) for one in document["passes"]]
-        self.harmonics = replace(
-            h,
-            gain=_complex(numbers["gain"]),
-            gain_variance=np.array(numbers["gain_variance"]),
-            without=_complex(numbers["without_m"]),
-            without_variance=np.array(numbers["without_variance_m2"]) if numbers["passes"] else h.without_variance,
-            covariance=_complex(numbers["covariance_m"]),
-            noise=np.array(numbers["noise_m2"]),
-            answered=_complex(numbers["answered_m"]),
-            scatter=np.array(numbers["scatter"]),
-            misfit=np.array(numbers["misfit"]),
-            innovation=_complex(numbers["innovation"]),
-            innovation_product=np.array(numbers["innovation_product"]),
-            innovation_square=np.array(numbers["innovation_square"]),
-            changed=np.array(numbers["changed"]),
-            answers=_complex(numbers["answers"]),
-            passes=numbers["passes"],
-        )
         with np.errstate(all="ignore"):
             expected, spread = self._expected(self.path - self.desired)
             whole = float(np.sum(expected)) + self._scatter() + (spread if self.harmonics.passes else 0.0)
         if not math.isfinite(whole) or (self.best and self.best.number > self.passes[-1].number):
             raise ModelError("its numbers do not belong together; learn the path again")
-
-
-def _check_size(name: str, values: Any, size: int) -> None:
-    """Raise ModelError if the last dimension of an array is of another size, or a value is not finite."""
-    found = np.array(values, dtype=np.float64)
-    if found.shape[-1:] != (size,) or not np.isfinite(found).all():
-        raise ModelError(f"{name} is not {size} finite numbers; learn the path again")
-
-
-def _listed(x: FloatArray | None) -> list[float] | None:
-    return None if x is None else x.tolist()
-
-
-def _array(values: list[float] | None) -> FloatArray | None:
-    return None if values is None else np.array(values, dtype=np.float64)
-
-
-def _pairs(x: ComplexArray) -> list[list[float]]:
-    return [x.real.tolist(), x.imag.tolist()]
-
-
-def _complex(pairs: list[list[float]]) -> ComplexArray:
-    return np.array(pairs[0]) + 1j * np.array(pairs[1])

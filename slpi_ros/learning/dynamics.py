@@ -7,7 +7,7 @@ pass before is a part of the estimate and not a disturbance that must be waited 
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import astuple, dataclass, replace
 from functools import cache
 from typing import Any
 
@@ -18,6 +18,7 @@ from slpi_ros.errors import ModelError
 from slpi_ros.learning.harmonics import Answer, ComplexArray
 from slpi_ros.learning.least_squares import Row, normal, solved, variance_of
 from slpi_ros.learning.modes import Mode, ModeAnswers, candidates
+from slpi_ros.learning.saved import Arrays, read, saved
 
 # Memory (s) of the impulse response beside the modes, its least and most samples, and those of them before the change:
 # a sensor or a time stamp may be early.
@@ -40,6 +41,14 @@ RINGS_ON, LEAST_SQUARE = 3.0, 0.04
 # Standard deviation of what is known exactly, as a share of that of an estimate; least one (m) of what excites a mode.
 EXACT = 1e-9
 LEAST_KICK = 1e-13
+# What is saved of a pass, and of the estimate.
+PASS_ARRAYS: Arrays = dict.fromkeys(("commanded", "reading"), (float, ("period",)))
+MODES: Arrays = dict.fromkeys(("modes", "begun"), (float, ("modes", 4)))
+ARRAYS: Arrays = {
+    **dict.fromkeys(("residues", "rings"), (complex, ("modes",))), "parameters": (float, ("parameters",)),
+    "oldest": (float, ("oldest", "oldest and one")), "carried": (float, ("carried", "carried and one")),
+}  # fmt: skip
+KICKS: Arrays = {"kicks": (float, ("kicks", 4))}
 
 
 @dataclass(frozen=True)
@@ -48,19 +57,6 @@ class Pass:
 
     commanded: FloatArray
     reading: FloatArray | None  # None: not learned from
-
-    @classmethod
-    def of(cls, document: Mapping[str, Any]) -> "Pass":
-        """Return the pass of a document."""
-        reading = document["reading_m"]
-        return cls(np.array(document["commanded_m"]), None if reading is None else np.array(reading))
-
-    def to_document(self) -> dict[str, Any]:
-        """Return the pass as a part of a document."""
-        return {
-            "commanded_m": self.commanded.tolist(),
-            "reading_m": None if self.reading is None else self.reading.tolist(),
-        }
 
 
 @dataclass(frozen=True)
@@ -136,30 +132,30 @@ class Dynamics:
 
     def restart(self, modes: Sequence[Mode]) -> None:
         """Begin the estimate anew, with these modes."""
-        self.modes = self._begun = tuple(modes)
-        self._residues = self._rings = np.zeros(len(self.modes), dtype=np.complex128)
+        self.modes = self.begun = tuple(modes)
+        self.residues = self.rings = np.zeros(len(self.modes), dtype=np.complex128)
         # Samples of the impulse response and residues; what has rung of which mode since the beginning of which pass.
-        self._parameters: FloatArray | None = None
-        self._kicked: list[tuple[int, int, complex]] = []
-        # What the oldest pass, and those that were forgotten, say of them: normal matrix and vector.
-        self._oldest: tuple[FloatArray, FloatArray] | None = None
-        self._carried: tuple[FloatArray, FloatArray] | None = None
+        self.parameters: FloatArray | None = None
+        self.kicked: list[tuple[int, int, complex]] = []
+        # What the oldest pass, and those that were forgotten, say of them: normal matrix, its last column the vector.
+        self.oldest: FloatArray | None = None
+        self.carried: FloatArray | None = None
 
     def transient(self, passes: Sequence[Pass], aim: FloatArray) -> ComplexArray:
         """Return the expected transient, (K,), metres, of the last pass, of which nothing is measured yet.
 
         `aim`: what will be commanded beyond the desired path in all passes after it, (N,), metres.
         """
-        if self._parameters is None or not self._follow:
+        if self.parameters is None or not self._follow:
             return np.zeros(self._w.size, dtype=np.complex128)
-        poles = ModeAnswers(self.modes, self._residues, self._rings)
+        poles = ModeAnswers(self.modes, self.residues, self.rings)
         answers = self._answers(passes, poles, len(passes) - 1)[-1] - self._settled(aim, poles)
-        linear = answers[:, : self._parameters.size]
-        return np.asarray(linear @ self._parameters + self._rung_on(poles, len(passes) - 1))
+        linear = answers[:, : self.parameters.size]
+        return np.asarray(linear @ self.parameters + self._rung_on(poles, len(passes) - 1))
 
     def answer(self, given: Measured) -> Answer:
         """Return the estimate after some passes, the last of which was just measured."""
-        search = len(given.passes) <= SEARCH_PASSES and sum(not mode.exact for mode in self._begun) < MOST_MODES
+        search = len(given.passes) <= SEARCH_PASSES and sum(not mode.exact for mode in self.begun) < MOST_MODES
         for _ in range(ITERATIONS if self.modes else 1):
             found = self._estimate(given, search=search)
             search = False
@@ -169,57 +165,44 @@ class Dynamics:
         return found
 
     def _add(self, mode: Mode) -> None:
-        self.modes, self._begun = (*self.modes, mode), (*self._begun, mode)
+        self.modes, self.begun = (*self.modes, mode), (*self.begun, mode)
         none = np.zeros(1, dtype=np.complex128)
-        self._residues, self._rings = np.append(self._residues, none), np.append(self._rings, none)
-        self._parameters, self._kicked = None, []
+        self.residues, self.rings = np.append(self.residues, none), np.append(self.rings, none)
+        self.parameters, self.kicked = None, []
 
     def to_document(self) -> dict[str, Any]:
         """Return the estimate as a part of a document."""
-        return {
-            "modes": [asdict(mode) for mode in self.modes],
-            "begun": [asdict(mode) for mode in self._begun],
-            "residues": [self._residues.real.tolist(), self._residues.imag.tolist()],
-            "ringing_m": [self._rings.real.tolist(), self._rings.imag.tolist()],
-            "kicks_m": [[at, mode, ring.real, ring.imag] for at, mode, ring in self._kicked],
-            "oldest": _listed(self._oldest),
-            "carried": _listed(self._carried),
-            "parameters": None if self._parameters is None else self._parameters.tolist(),
-        }
+        modes = {name: [[*map(float, astuple(mode))] for mode in getattr(self, name)] for name in MODES}
+        kicks = [[at, mode, ring.real, ring.imag] for at, mode, ring in self.kicked]
+        return saved(self, ARRAYS) | modes | {"kicks": kicks}
 
     def resume(self, document: Mapping[str, Any]) -> None:
         """Go on from a document of the same path and model; ModelError if its parts are of different sizes."""
-        self._check_sizes(document)
-        self.restart([Mode(**one) for one in document["begun"]])
-        self.modes = tuple(Mode(**one) for one in document["modes"])
-        self._residues, self._rings = (
-            np.array(document[name][0]) + 1j * np.array(document[name][1]) for name in ("residues", "ringing_m")
-        )
-        self._kicked = [(at, mode, complex(*ring)) for at, mode, *ring in document["kicks_m"]]
-        self._oldest, self._carried = (
-            document[name] and (np.array(document[name][0]), np.array(document[name][1]))
-            for name in ("oldest", "carried")
-        )
-        if document["parameters"] is not None:
-            self._parameters = np.array(document["parameters"])
-
-    def _check_sizes(self, document: Mapping[str, Any]) -> None:
         count = len(document["modes"])
-        size = self._taps + 2 * count
-        shapes = {"begun": (count,), "residues": (2, count), "ringing_m": (2, count), "parameters": (size,)}
-        wrong = [name for name, shape in shapes.items() if np.shape(document[name]) not in ((), shape)]
-        for name in ("oldest", "carried"):
-            if (pair := document[name]) is not None:
-                matrix, vector = (np.shape(part) for part in pair)
-                wrong += [name] if len(vector) != 1 or vector[0] > size or matrix != 2 * vector else []
-        wrong += ["kicks_m"] if any(mode >= count for _, mode, *_ in document["kicks_m"]) else []
-        if wrong:
-            raise ModelError(f"{wrong[0]} does not fit to {count} modes; learn the path anew")
+        own = self._taps + 2 * count
+        sizes: dict[str | int, int] = {"modes": count, "parameters": own}
+        found = read(document, {**MODES, **ARRAYS, **KICKS}, sizes)
+        modes, begun = (
+            tuple(Mode(rate, angle, bool(exact), unsure) for rate, angle, exact, unsure in found[name].tolist())
+            for name in MODES
+        )
+        self.restart(begun)
+        self.modes = modes
+        for name in ARRAYS:
+            setattr(self, name, found[name])
+        self.kicked = [(round(at), round(mode), complex(*ring)) for at, mode, *ring in found["kicks"].tolist()]
+        wrong = [
+            one
+            for one in (self.oldest, self.carried)
+            if one is not None and not len(one) + 1 == one.shape[1] <= own + 1
+        ]
+        if wrong or not set(found["kicks"][:, 1].tolist()) <= set(range(count)):
+            raise ModelError(f"its parts do not fit to {count} modes; learn the path anew")
 
     def _estimate(self, given: Measured, *, search: bool) -> Answer:
         passes, undisturbed, of_change = given.passes, given.undisturbed, given.of_change
         assert undisturbed.reading is not None
-        poles = ModeAnswers(self.modes, self._residues, self._rings)
+        poles = ModeAnswers(self.modes, self.residues, self.rings)
         answers, fixed = self._answers(passes, poles), self._response(self._w, poles)
         tones = self._tones(passes, poles, of_change)
         rung = [poles.ringing(self._size, j) for j in range(len(passes))]
@@ -248,7 +231,7 @@ class Dynamics:
         rows.append(Row(whole, np.fft.rfft(undisturbed.reading), given.rest + given.noise, free, None))
         prior = self._prior(poles, float(np.std(undisturbed.reading)), tones)
         rows, parameters, covariance = solved(rows, prior)
-        self._oldest = self._own_part(rows[0], parameters) if rows[0].before == 0 else None
+        self.oldest = self._own_part(rows[0], parameters) if rows[0].before == 0 else None
         self._missing = self._missing_mode(passes, given.desired, rows, parameters, covariance) if search else None
 
         response = self._joined(fixed, no_ringing, no_tones)
@@ -269,33 +252,32 @@ class Dynamics:
         From now on the poles are those that were estimated, and what rings from before is unknown again.
         """
         self.modes = tuple(replace(mode, exact=True) for mode in self.modes)
-        self._kicked = [(at - 1, mode, ring) for at, mode, ring in self._kicked]
-        self._rings = self._rings * np.array([mode.step**self._size for mode in self.modes])
-        if self._oldest is not None:
-            before = self._carried or (np.zeros_like(self._oldest[0]), np.zeros_like(self._oldest[1]))
-            self._carried = before[0] + self._oldest[0], before[1] + self._oldest[1]
-            self._oldest = None
+        self.kicked = [(at - 1, mode, ring) for at, mode, ring in self.kicked]
+        self.rings = self.rings * np.array([mode.step**self._size for mode in self.modes])
+        if self.oldest is not None:
+            self.carried = self.oldest if self.carried is None else self.carried + self.oldest
+            self.oldest = None
 
-    def _own_part(self, row: Row, parameters: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def _own_part(self, row: Row, parameters: FloatArray) -> FloatArray:
         """Return normal matrix and vector of a row for the samples of the impulse response and the residues only."""
         count = self._taps + 2 * len(self.modes)
         rest = row.explained - row.columns[:, count:] @ parameters[count:]
-        return normal(row.columns[1:, :count], rest[1:], 1.0 / np.maximum(row.variance[1:], 1e-300))
+        return np.column_stack(normal(row.columns[1:, :count], rest[1:], 1.0 / np.maximum(row.variance[1:], 1e-300)))
 
     def _take(self, parameters: FloatArray, tones: Sequence[Tone], poles: ModeAnswers) -> None:
         """Take over an estimate, (P,)."""
         count = len(self.modes)
         pairs = parameters[self._taps :].reshape(3 * count + len(tones), 2)
         moves, unit = pairs[count : 2 * count].tolist(), np.array([1.0, 1j])
-        self._rings = pairs[2 * count : 3 * count] @ unit
-        self._kicked = [
+        self.rings = pairs[2 * count : 3 * count] @ unit
+        self.kicked = [
             (one.number, one.mode, poles.kick(one.mode, self._size, one.harmonic, complex(pair @ unit)))
             for one, pair in zip(tones, pairs[3 * count :], strict=True)
         ]
-        self._residues, self._parameters = pairs[:count] @ unit, parameters[: self._taps + 2 * count]
+        self.residues, self.parameters = pairs[:count] @ unit, parameters[: self._taps + 2 * count]
         self.modes = tuple(
             mode.moved(*by).near(begun.angle, REACH * max(POLE * begun.angle, begun.unsure))
-            for mode, by, begun in zip(self.modes, moves, self._begun, strict=True)
+            for mode, by, begun in zip(self.modes, moves, self.begun, strict=True)
         )
 
     def _tones(
@@ -315,8 +297,8 @@ class Dynamics:
             if not moved.any():
                 continue
             squares = of_change(moved)
-            for k, (mode, begun) in enumerate(zip(self.modes, self._begun, strict=True)):
-                if begun.exact or mode.rate * self._size > RINGS_ON or not self._residues[k]:
+            for k, (mode, begun) in enumerate(zip(self.modes, self.begun, strict=True)):
+                if begun.exact or mode.rate * self._size > RINGS_ON or not self.residues[k]:
                     continue
                 below = int(mode.angle / (2.0 * np.pi) * self._size)
                 for harmonic in (below, below + 1):
@@ -334,18 +316,18 @@ class Dynamics:
 
     def _rung_on(self, poles: ModeAnswers, number: int) -> ComplexArray:
         """Return what rings in a pass of what is known to ring, (K,), metres."""
-        rings = np.zeros(len(self.modes), dtype=np.complex128) + self._rings
-        for at, mode, ring in self._kicked:
+        rings = np.zeros(len(self.modes), dtype=np.complex128) + self.rings
+        for at, mode, ring in self.kicked:
             rings[mode] += ring / self.modes[mode].step ** (at * self._size)
         pairs = np.stack([rings.real, rings.imag], axis=1).ravel()
         return np.asarray(poles.ringing(self._size, number)[:, : pairs.size] @ pairs)
 
     def _parameters_response(self, poles: ModeAnswers) -> ComplexArray:
         """Return the present estimate of the gain, (K,)."""
-        if self._parameters is None:
+        if self.parameters is None:
             return np.ones(self._w.size, dtype=np.complex128)
         response = self._response(self._w, poles)
-        return np.asarray(response[:, : self._parameters.size] @ self._parameters)
+        return np.asarray(response[:, : self.parameters.size] @ self.parameters)
 
     def _response(self, w: FloatArray, poles: ModeAnswers) -> ComplexArray:
         """Return the frequency response of each parameter, (len(w), P), at `w` (rad/sample)."""
@@ -388,22 +370,22 @@ class Dynamics:
         sds, means = [math.inf] * self._taps, [0.0] * self._taps
         for mode in self.modes:
             sds += [RESIDUE * mode.angle] * 2
-        for mode, begun in zip(self.modes, self._begun, strict=True):
+        for mode, begun in zip(self.modes, self.begun, strict=True):
             exact = EXACT if mode.exact else 1.0
             sds += [exact * DECAY * begun.rate, exact * max(POLE * begun.angle, begun.unsure)]
         sds += [scale] * (2 * len(self.modes))
         for one in tones:
             sds += [one.size] * 2
         means += [0.0] * (2 * len(self.modes))
-        for mode, begun in zip(self.modes, self._begun, strict=True):
+        for mode, begun in zip(self.modes, self.begun, strict=True):
             means += [0.0, 0.0] if mode.exact else [mode.rate - begun.rate, begun.angle - mode.angle]
         means += [0.0] * (len(sds) - len(means))
         weights = 1.0 / np.array(sds) ** 2
         information, vector = information + np.diag(weights), vector + np.array(means) * weights
-        if self._carried is not None:
-            count = self._carried[1].size
-            information[:count, :count] += self._carried[0]
-            vector[:count] += self._carried[1]
+        if self.carried is not None:
+            count = len(self.carried)
+            information[:count, :count] += self.carried[:, :-1]
+            vector[:count] += self.carried[:, -1]
         return information, vector
 
     def _missing_mode(
@@ -461,7 +443,3 @@ class Dynamics:
                     answered = response * moved[:, None]
             found.append(np.concatenate([answered, ringing], axis=1)[1:])
         return found
-
-
-def _listed(pair: tuple[FloatArray, FloatArray] | None) -> list[Any] | None:
-    return None if pair is None else [pair[0].tolist(), pair[1].tolist()]

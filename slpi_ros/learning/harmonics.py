@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from slpi_ros.arrays import FloatArray, Mask
+from slpi_ros.learning.saved import Arrays
 
 ComplexArray = NDArray[np.complex128]
 
@@ -37,6 +38,12 @@ RIDDLE = 8.0
 MOST_MISFIT = 4.0
 # A share of the noise's new estimate in each pass, of one harmonic and (by this number of harmonics) of the floor.
 NOISE_SHARE, FLOOR_COUNT = 0.1, 200.0
+# What is saved.
+HARMONICS_ARRAYS: Arrays = {
+    **dict.fromkeys(("gain", "without", "covariance", "answered", "innovation", "answers"), (complex, ("harmonics",))),
+    **dict.fromkeys(("gain_variance", "without_variance", "noise", "scatter", "misfit"), (float, ("harmonics",))),
+    **dict.fromkeys(("innovation_product", "innovation_square", "changed"), (float, ("harmonics",))),
+}
 
 
 @dataclass(frozen=True)
@@ -130,24 +137,12 @@ class Harmonics:
     def first(cls, gain: ComplexArray, variance: FloatArray, noise: FloatArray, amplified: FloatArray) -> "Harmonics":
         """Return what is known before the first pass: the first guess of the gains, the sensor's noise, and modes."""
         none = np.zeros_like(gain)
+        zero, one, unknown = np.zeros_like(noise), np.ones_like(noise), np.full(noise.size, np.inf)
         return cls(
-            gain,
-            none,
-            variance,
-            np.full(variance.size, np.inf),
-            none,
-            noise,
-            none,
-            np.zeros_like(noise),
-            np.zeros_like(noise),
-            none,
-            np.zeros_like(noise),
-            np.ones_like(noise),
-            np.zeros_like(noise),
-            none,
-            variance,
-            amplified,
-        )
+            gain=gain, without=none, gain_variance=variance, without_variance=unknown, covariance=none, noise=noise,
+            answered=none, scatter=zero, misfit=zero, innovation=none, innovation_product=zero, innovation_square=one,
+            changed=zero, answers=none, guessed=variance, amplified=amplified,
+        )  # fmt: skip
 
     def expected(self, correction: ComplexArray) -> ComplexArray:
         """Return the expected reading, (K,), metres, of a pass with a correction (m)."""

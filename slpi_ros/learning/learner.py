@@ -19,7 +19,7 @@ from slpi_ros.learning.axis_learner import AxisLearner, PassReport
 from slpi_ros.model.document import format_model
 from slpi_ros.model.stage_model import Signal, StageModel, check_time
 
-SCHEMA = "slpi_ros/learned/1"
+SCHEMA = "slpi_ros/learned/2"
 # Fewest samples of a pass, and largest deviation of a sampling interval from their mean.
 FEWEST, UNEVEN = 8, 0.2
 
@@ -165,7 +165,7 @@ class Learner:
         Of another model, learning begins again from the correction of the path. ModelError, which begins with `source`,
         if the document is not valid, or of another stage or path; then nothing of it is taken over.
         """
-        validate(document, "learned", source)
+        check_version(document, source)
         try:
             json.dumps(document, allow_nan=False)
         except ValueError:
@@ -181,8 +181,7 @@ class Learner:
         remarks, axes = [], {name: axis.begun_again() for name, axis in self.axes.items()}
         for name, axis in axes.items():
             learned = document["axes"][name]
-            # A file of an earlier version tells nothing of the dynamics, or of the innovations.
-            same = learned["model"] == self._identity(name) and "before_m" in learned
+            same = learned["model"] == self._identity(name)
             try:
                 axis.resume(learned, same_model=same)
             except ModelError as error:
@@ -191,8 +190,7 @@ class Learner:
                 what = f"it has no {error}" if isinstance(error, KeyError) else "its numbers do not belong together"
                 raise ModelError(f"{source}: axis '{name}': {what}; learn the path again") from None
             if not same:
-                why = "a file of an earlier version" if learned["model"] == self._identity(name) else "another model"
-                remarks.append(f"axis '{name}': {why}; learned again, from the correction of the path so far")
+                remarks.append(f"axis '{name}': another model; learned anew, from the correction of the path so far")
         self.axes = axes
         return remarks
 
@@ -263,6 +261,14 @@ def path_identity(t: FloatArray, desired: Mapping[str, FloatArray]) -> str:
     return digest.hexdigest()
 
 
+def check_version(document: object, source: str) -> None:
+    """Raise ModelError if a document, as from ``json.loads``, is of another version, or not valid."""
+    version = document.get("schema", SCHEMA) if isinstance(document, Mapping) else SCHEMA
+    if version != SCHEMA:
+        raise ModelError(f"{source}: of version {str(version)[:60]!r}, this one reads {SCHEMA}; learn the path again")
+    validate(document, "learned", source)
+
+
 def read_learned(path: str | os.PathLike[str]) -> dict[str, Any]:
     """Read a document of what was learned from a file; ModelError if it is none."""
     try:
@@ -270,6 +276,6 @@ def read_learned(path: str | os.PathLike[str]) -> dict[str, Any]:
     except (OSError, ValueError, RecursionError) as error:
         reason = error.strerror if isinstance(error, OSError) else "it is no JSON document"
         raise ModelError(f"{path}: cannot read what was learned: {reason}; leave it out to learn again") from None
-    validate(document, "learned", str(path))
+    check_version(document, str(path))
     found: dict[str, Any] = document
     return found

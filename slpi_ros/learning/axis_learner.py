@@ -13,7 +13,7 @@ from slpi_ros.errors import ModelError, length
 from slpi_ros.learning.dynamics import PASS_ARRAYS, Dynamics, Measured, Pass
 from slpi_ros.learning.first_guess import amplification, first_guess, known_modes, ringing
 from slpi_ros.learning.harmonics import HARMONICS_ARRAYS, ComplexArray, Harmonics
-from slpi_ros.learning.passes import Judged, agreed, held_back, judge
+from slpi_ros.learning.passes import Judged, held_back, judge
 from slpi_ros.learning.saved import Arrays, read, saved
 from slpi_ros.learning.spectrum import PathSpectrum
 from slpi_ros.model.axis_model import AxisModel
@@ -208,22 +208,19 @@ class AxisLearner:
         )
         low, high = self.axis.displacement_range
         seen = np.where(np.abs(seen - self.desired) <= FAR * (high - low), seen, np.nan)
-        first = not self.harmonics.passes
         expected, spread = self._expected(commanded)
         floor = math.sqrt(self.spectrum.power(np.full(self.frequency.size, self.harmonics.noise.min())))
         error = next((one.error for one in reversed(self.passes) if one.learned), math.inf)
-        judged = judge(seen, expected, spread, floor, self.deviating, error)
-        if self.lead_in is not None and not judged.reason:
-            judged = agreed(self.lead_in, judged, self.desired, floor)
+        before = expected if self.harmonics.passes else self.lead_in
+        judged = judge(seen, self.desired, before, spread, floor, self.deviating, error)
         # What a limit held back, or was not used for another reason, tells nothing of the sensor.
         known = unusable or self._replayed(measured, commanded)
         if not known and voltage is not None and (known := held_back(voltage, self.voltage)):
             self.clipped = "voltage range"
         reason = known or judged.reason
-        offset, drift = self._offset_and_drift(judged, expected, first=first)
+        offset, drift = self._offset_and_drift(judged, expected)
         clean = judged.measured - offset - drift * (np.arange(measured.size) / measured.size - 0.5)
-        rest = (clean - self.desired)[np.isfinite(clean)]
-        whole = (seen - self.desired)[np.isfinite(seen)]
+        rest, whole = ((x - self.desired)[np.isfinite(x)] for x in (clean, seen))
         rms, absolute = (float(np.sqrt(np.mean(x**2))) if x.size else math.nan for x in (rest, whole))
         self._remember(commanded, None if reason else clean)
         if reason:
@@ -467,7 +464,7 @@ class AxisLearner:
         freedom = 2.0 * float(noise.sum()) ** 2 / float((noise**2).sum())
         return WORSE_BY_NOISE * self.noise**2 * math.sqrt(2.0 / freedom)
 
-    def _offset_and_drift(self, judged: Judged, expected: FloatArray, *, first: bool) -> tuple[float, float]:
+    def _offset_and_drift(self, judged: Judged, expected: FloatArray) -> tuple[float, float]:
         """Return mean error (m) and drift over the pass (m).
 
         The drift is what both the mean against the pass before and the slope within this pass say, whichever is less.
@@ -476,7 +473,7 @@ class AxisLearner:
         if not known.any():
             return 0.0, 0.0
         offset = float(np.mean((judged.measured - self.desired)[known]))
-        if first or self.offset is None:
+        if self.offset is None or not self.harmonics.passes:
             return offset, 0.0
         shares = np.linspace(-0.5, 0.5, known.size)[known]
         slope = float(np.polynomial.polynomial.polyfit(shares, (judged.measured - expected)[known], 1)[1])

@@ -30,8 +30,6 @@ WORSE, WORSE_BY_NOISE, UNSURE = 1.1, 4.0, 3.0
 MOST_RETURNS, MOST_REFUSED = 2, 3
 # How a text begins and ends that says why learning is held.
 HELD, ANEW = "held", "forget what was learned to begin again"
-# Passes after which the best one is forgotten, as the stage is another one by then.
-BEST_PASSES = 50
 # Largest part of the stroke that learning may add to the desired path, by default.
 LIMIT_SHARE = 0.25
 # Readings further from the path than this many strokes are none.
@@ -52,13 +50,6 @@ RUNG_UP, MOST_UNCHANGED = 2.0, 3
 SAME_PATH = 1e-13
 # A harmonic's error counts beyond this many standard deviations.
 CLEAR = 2.0
-# Passes after the first two in which what does not settle at once may still be large.
-SETTLING = 3
-# The best path once more has not settled as long as a pass has less than this share of the mean square error of the one
-# before; most passes that are waited for.
-FALLING, MOST_SETTLING = 0.85, 6
-# Passes after the best one in which what is calculated to be transient excuses a larger error.
-EXCUSED = 4
 # Share of a larger error that the answer to what was changed has at least, if it is to be blamed.
 BLAMED = 0.5
 
@@ -67,7 +58,7 @@ ARRAYS: Arrays = {
     **dict.fromkeys(("correction", "last", "before", "lead_in"), (float, ("path",))), "deviating": (bool, ("path",))
 }  # fmt: skip
 FIGURES = (
-    "gain", "held", "returns", "returned", "refused", "record", "settling", "worst", "offset", "clipped", "hashes",
+    "gain", "held", "returns", "returned", "refused", "record", "worst", "offset", "clipped", "hashes",
 )  # fmt: skip
 BEST_ARRAYS: Arrays = dict.fromkeys(("correction", "reading"), (float, ("path",)))
 BEST_FIGURES = ("number", "power")
@@ -143,8 +134,7 @@ class AxisLearner:
         self._unchanged = int(np.clip(math.ceil(RUNG_UP * longest / duration) + 1, 2, MOST_UNCHANGED))
         self._onset = 0.5 - 0.5 * np.cos(np.pi * np.minimum((np.arange(desired.size) + (rising == 1.0)) / rising, 1.0))
         self.lead_in: FloatArray | None = None
-        self.returned = 0  # passes of the best path again, until it has settled
-        self.settling = math.inf  # m^2, mean square error of the pass before
+        self.returned = False  # whether the best path is followed once more
         self.worst = 0.0  # m^2, largest mean square error of a pass from which learning went back
         self._history: list[Pass] = []
         self.undisturbed: Pass | None = None  # the second pass, from which on the path is changed
@@ -246,9 +236,9 @@ class AxisLearner:
         transient = self.dynamics.transient(following, whole(self.correction))
         change = np.abs(self.spectrum.of(commanded - self.last)) ** 2
         spread = power(harmonics.variance(correction) + harmonics.noise) + ANSWER**2 * power(change)
-        # What is transient is expected with a doubt of its own size; and the first passes have not settled.
+        # What is transient is expected with a doubt of its own size; and the best path once more has not settled.
         spread += power(np.abs(transient) ** 2)
-        if harmonics.passes <= SETTLING or self.returned:
+        if self.returned:
             spread += next((one.error for one in reversed(self.passes) if one.learned), 0.0) ** 2
         return self.spectrum.signal(harmonics.expected(correction) + transient), math.sqrt(spread)
 
@@ -284,18 +274,16 @@ class AxisLearner:
         mean variance of that. What is transient may be wrong: a better pass has to be so with it and without it.
         """
         number, power, best = len(self.passes) + 1, max(steady, rms**2), self.best
-        if best is not None and number - best.number > BEST_PASSES:
-            best = None
         if best is not None and self.returned:
             return self._settled_again(best, clean, rms**2)
-        self.returned = 0
+        self.returned = False
         if best is None or power < best.power:
             if power < self.record - self._scatter():
                 self.returns, self.gain = 0, min(GROWING * self.gain, GAIN)
             self.record = min(self.record, power)
             self.best = _Best(number, power, self.correction, clean)
             return True
-        least = min(steady, rms**2) if number - best.number <= EXCUSED else rms**2
+        least = min(steady, rms**2)
         harmful = rms**2 > self._harm + self._scatter()
         if not harmful and least <= self._much_worse(best.power, unsure):
             return True
@@ -310,13 +298,8 @@ class AxisLearner:
         return False
 
     def _settled_again(self, best: _Best, clean: FloatArray, power: float) -> bool:
-        """Judge the best path once more: its error was lucky, or what has come between is still settling."""
-        falling, self.settling = power < FALLING * self.settling, power
-        self.returned += 1
-        if falling and self.returned <= MOST_SETTLING:
-            self._told = "its changes are still settling"
-            return False
-        self.returned = 0
+        """Judge the best path once more: its error was lucky, or the stage is another one by now."""
+        self.returned = False
         self.best = replace(best, power=power, reading=clean)
         if power > self._harm + self._scatter():
             self._give_up()
@@ -330,7 +313,7 @@ class AxisLearner:
         """
         at_first = self.returns >= MOST_RETURNS and np.array_equal(self.correction, self._start)
         if self.held and at_first and rms**2 > self.worst + self._scatter():
-            self.held, self.returns, self.best, self.record, self.returned = "", 0, None, math.inf, 0
+            self.held, self.returns, self.best, self.record, self.returned = "", 0, None, math.inf, False
 
     def _give_up(self) -> None:
         """Follow the path as it was at first: nothing that was learned is better."""
@@ -400,7 +383,7 @@ class AxisLearner:
         """Go back to the best pass with half the gain; the second time without a better one since, hold."""
         assert self.best is not None
         self.correction = self.best.correction
-        self.returned, self.settling, self.worst = 1, rms**2, max(self.worst, rms**2)
+        self.returned, self.worst = True, max(self.worst, rms**2)
         # What was learned of the last pass is not to make a riddle of the next one.
         self.harmonics = self.harmonics.at(self.spectrum.of(self.best.correction), self.spectrum.of(self.best.reading))
         self._told = f"{why}; back to the best, at half the gain"
@@ -421,7 +404,7 @@ class AxisLearner:
         self._told = reason
         self.refused += 1
         if self.best is not None and (new or self.refused >= MOST_REFUSED):
-            self.correction, self.returned, self.settling = self.best.correction, 1, math.inf
+            self.correction, self.returned = self.best.correction, True
             if answered:
                 self._blame_change(f"{reason}, after a change")
         if self.refused >= MOST_REFUSED:
@@ -525,7 +508,7 @@ class AxisLearner:
             setattr(self, name, value)
         for name in ("correction", "before"):
             setattr(self, name, np.clip(getattr(self, name), -self.limit, self.limit))
-        self.record, self.settling = (math.inf if one is None else one for one in (self.record, self.settling))
+        self.record = math.inf if self.record is None else self.record
         best, undisturbed, harmonics = (document[name] for name in ("best", "undisturbed", "harmonics"))
         self.best = best and _Best(**read(best, BEST_ARRAYS, sizes, BEST_FIGURES))
         self.undisturbed = undisturbed and Pass(**read(undisturbed, PASS_ARRAYS, sizes))

@@ -15,6 +15,7 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import ModelError
+from slpi_ros.learning.first_guess import DOUBT
 from slpi_ros.learning.harmonics import Answer, ComplexArray
 from slpi_ros.learning.least_squares import Row, normal, solved, variance_of
 from slpi_ros.learning.modes import Mode, ModeAnswers, candidates
@@ -34,13 +35,8 @@ BESIDE = (-0.1, -0.05, -0.01, 0.0, 0.01, 0.05, 0.1)
 # A mode is looked for in the first passes, in the last rows of the estimate, as long as there are fewer. It counts if
 # it takes this share of what is left, weighted, and so much of it (chi squared). Share of rounding errors.
 SEARCH_PASSES, SEARCHED, MOST_MODES, EXPLAINED, CLEARLY, RIDGE = 8, 5, 3, 0.15, 15.0, 1e-6
-# Relative standard deviation of a gain that is not the same along the path, as the slope of a hysteresis is not.
-UNLIKE = 0.05
-# A mode rings on if it falls by less than exp of this in a pass; least square of a gain through which it is excited.
-RINGS_ON, LEAST_SQUARE = 3.0, 0.04
-# Standard deviation of what is known exactly, as a share of that of an estimate; least one (m) of what excites a mode.
+# Standard deviation of what is known exactly, as a share of that of an estimate.
 EXACT = 1e-9
-LEAST_KICK = 1e-13
 # What is saved of a pass, and of the estimate.
 PASS_ARRAYS: Arrays = dict.fromkeys(("commanded", "reading"), (float, ("period",)))
 MODES: Arrays = dict.fromkeys(("modes", "begun"), (float, ("modes", 4)))
@@ -48,7 +44,6 @@ ARRAYS: Arrays = {
     **dict.fromkeys(("residues", "rings"), (complex, ("modes",))), "parameters": (float, ("parameters",)),
     "oldest": (float, ("oldest", "oldest and one")), "carried": (float, ("carried", "carried and one")),
 }  # fmt: skip
-KICKS: Arrays = {"kicks": (float, ("kicks", 4))}
 
 
 @dataclass(frozen=True)
@@ -57,16 +52,6 @@ class Pass:
 
     commanded: FloatArray
     reading: FloatArray | None  # None: not learned from
-
-
-@dataclass(frozen=True)
-class Tone:
-    """A harmonic near a mode, which a change of the path has excited from the beginning of a pass on."""
-
-    number: int  # of the pass
-    mode: int
-    harmonic: int
-    size: float  # m, standard deviation of the sum over the samples of what excites
 
 
 @dataclass(frozen=True)
@@ -134,9 +119,8 @@ class Dynamics:
         """Begin the estimate anew, with these modes."""
         self.modes = self.begun = tuple(modes)
         self.residues = self.rings = np.zeros(len(self.modes), dtype=np.complex128)
-        # Samples of the impulse response and residues; what has rung of which mode since the beginning of which pass.
+        # Samples of the impulse response and residues.
         self.parameters: FloatArray | None = None
-        self.kicked: list[tuple[int, int, complex]] = []
         # What the oldest pass, and those that were forgotten, say of them: normal matrix, its last column the vector.
         self.oldest: FloatArray | None = None
         self.carried: FloatArray | None = None
@@ -151,7 +135,9 @@ class Dynamics:
         poles = ModeAnswers(self.modes, self.residues, self.rings)
         answers = self._answers(passes, poles, len(passes) - 1)[-1] - self._settled(aim, poles)
         linear = answers[:, : self.parameters.size]
-        return np.asarray(linear @ self.parameters + self._rung_on(poles, len(passes) - 1))
+        pairs = np.stack([self.rings.real, self.rings.imag], axis=1).ravel()
+        rung = poles.ringing(self._size, len(passes) - 1)[:, : pairs.size]
+        return np.asarray(linear @ self.parameters + rung @ pairs)
 
     def answer(self, given: Measured) -> Answer:
         """Return the estimate after some passes, the last of which was just measured."""
@@ -168,20 +154,19 @@ class Dynamics:
         self.modes, self.begun = (*self.modes, mode), (*self.begun, mode)
         none = np.zeros(1, dtype=np.complex128)
         self.residues, self.rings = np.append(self.residues, none), np.append(self.rings, none)
-        self.parameters, self.kicked = None, []
+        self.parameters = None
 
     def to_document(self) -> dict[str, Any]:
         """Return the estimate as a part of a document."""
         modes = {name: [[*map(float, astuple(mode))] for mode in getattr(self, name)] for name in MODES}
-        kicks = [[at, mode, ring.real, ring.imag] for at, mode, ring in self.kicked]
-        return saved(self, ARRAYS) | modes | {"kicks": kicks}
+        return saved(self, ARRAYS) | modes
 
     def resume(self, document: Mapping[str, Any]) -> None:
         """Go on from a document of the same path and model; ModelError if its parts are of different sizes."""
         count = len(document["modes"])
         own = self._taps + 2 * count
         sizes: dict[str | int, int] = {"modes": count, "parameters": own}
-        found = read(document, {**MODES, **ARRAYS, **KICKS}, sizes)
+        found = read(document, {**MODES, **ARRAYS}, sizes)
         modes, begun = (
             tuple(Mode(rate, angle, bool(exact), unsure) for rate, angle, exact, unsure in found[name].tolist())
             for name in MODES
@@ -190,13 +175,12 @@ class Dynamics:
         self.modes = modes
         for name in ARRAYS:
             setattr(self, name, found[name])
-        self.kicked = [(round(at), round(mode), complex(*ring)) for at, mode, *ring in found["kicks"].tolist()]
         wrong = [
             one
             for one in (self.oldest, self.carried)
             if one is not None and not len(one) + 1 == one.shape[1] <= own + 1
         ]
-        if wrong or not set(found["kicks"][:, 1].tolist()) <= set(range(count)):
+        if wrong:
             raise ModelError(f"its parts do not fit to {count} modes; learn the path anew")
 
     def _estimate(self, given: Measured, *, search: bool) -> Answer:
@@ -204,10 +188,8 @@ class Dynamics:
         assert undisturbed.reading is not None
         poles = ModeAnswers(self.modes, self.residues, self.rings)
         answers, fixed = self._answers(passes, poles), self._response(self._w, poles)
-        tones = self._tones(passes, poles, of_change)
         rung = [poles.ringing(self._size, j) for j in range(len(passes))]
-        toned = [self._tone_columns(tones, poles, j, settled=True) for j in range(len(passes))]
-        no_ringing, no_tones = np.zeros_like(rung[0]), np.zeros_like(toned[0])
+        no_ringing = np.zeros_like(rung[0])
         rows: list[Row] = []
         last: int | None = None
         free: int | None = None
@@ -222,28 +204,28 @@ class Dynamics:
                 differ = np.fft.rfft(one.reading - reading)
                 # What settles slowly ends elsewhere than it begins: its harmonics fall with their number.
                 settling = float(np.abs(differ[1:4]).max()) ** 2 / np.maximum(np.arange(differ.size), 1) ** 2
-                answered = self._joined(answers[j] - answers[last], rung[j] - rung[last], toned[j] - toned[last])
+                answered = self._joined(answers[j] - answers[last], rung[j] - rung[last])
                 variance = 2.0 * given.noise + (of_change(moved) if moved.any() else settling)
                 rows.append(Row(answered, differ, variance, j, last))
             last, reading = j, one.reading
         # The path itself: what it excites, but for what is left of its hysteresis.
-        whole = self._joined(fixed * given.desired[:, None], no_ringing if free is None else rung[free], no_tones)
+        whole = self._joined(fixed * given.desired[:, None], no_ringing if free is None else rung[free])
         rows.append(Row(whole, np.fft.rfft(undisturbed.reading), given.rest + given.noise, free, None))
-        prior = self._prior(poles, float(np.std(undisturbed.reading)), tones)
+        prior = self._prior(poles, float(np.std(undisturbed.reading)))
         rows, parameters, covariance = solved(rows, prior)
         self.oldest = self._own_part(rows[0], parameters) if rows[0].before == 0 else None
         self._missing = self._missing_mode(passes, given.desired, rows, parameters, covariance) if search else None
 
-        response = self._joined(fixed, no_ringing, no_tones)
+        response = self._joined(fixed, no_ringing)
         gain, now = response @ parameters, np.zeros_like(response)
         if self._follow:
-            still = self._tone_columns(tones, poles, len(passes) - 1, settled=False)
-            now = self._joined(answers[-1] - self._settled(given.aim, poles), rung[-1], still)
+            now = self._joined(answers[-1] - self._settled(given.aim, poles), rung[-1])
         found = Answer(
-            gain, variance_of(response, covariance) + (UNLIKE * np.abs(gain)) ** 2, now @ parameters,
+            # A gain is not the same along the path, as the slope of a hysteresis is not.
+            gain, variance_of(response, covariance) + (DOUBT * np.abs(gain)) ** 2, now @ parameters,
             variance_of(now, covariance),
         )  # fmt: skip
-        self._take(parameters, tones, poles)
+        self._take(parameters)
         return found
 
     def forget_oldest(self) -> None:
@@ -252,7 +234,6 @@ class Dynamics:
         From now on the poles are those that were estimated, and what rings from before is unknown again.
         """
         self.modes = tuple(replace(mode, exact=True) for mode in self.modes)
-        self.kicked = [(at - 1, mode, ring) for at, mode, ring in self.kicked]
         self.rings = self.rings * np.array([mode.step**self._size for mode in self.modes])
         if self.oldest is not None:
             self.carried = self.oldest if self.carried is None else self.carried + self.oldest
@@ -264,70 +245,17 @@ class Dynamics:
         rest = row.explained - row.columns[:, count:] @ parameters[count:]
         return np.column_stack(normal(row.columns[1:, :count], rest[1:], 1.0 / np.maximum(row.variance[1:], 1e-300)))
 
-    def _take(self, parameters: FloatArray, tones: Sequence[Tone], poles: ModeAnswers) -> None:
+    def _take(self, parameters: FloatArray) -> None:
         """Take over an estimate, (P,)."""
         count = len(self.modes)
-        pairs = parameters[self._taps :].reshape(3 * count + len(tones), 2)
+        pairs = parameters[self._taps :].reshape(3 * count, 2)
         moves, unit = pairs[count : 2 * count].tolist(), np.array([1.0, 1j])
         self.rings = pairs[2 * count : 3 * count] @ unit
-        self.kicked = [
-            (one.number, one.mode, poles.kick(one.mode, self._size, one.harmonic, complex(pair @ unit)))
-            for one, pair in zip(tones, pairs[3 * count :], strict=True)
-        ]
         self.residues, self.parameters = pairs[:count] @ unit, parameters[: self._taps + 2 * count]
         self.modes = tuple(
             mode.moved(*by).near(begun.angle, REACH * max(POLE * begun.angle, begun.unsure))
             for mode, by, begun in zip(self.modes, moves, self.begun, strict=True)
         )
-
-    def _tones(
-        self, passes: Sequence[Pass], poles: ModeAnswers, of_change: Callable[[ComplexArray], FloatArray]
-    ) -> list[Tone]:
-        """Return the harmonics near a mode that rings from pass to pass which a change of the path may have excited.
-
-        What is left of the hysteresis of the path is another one then, and acts as a change of the path that nobody
-        commanded: the mode takes as long to answer to it.
-        """
-        found: list[Tone] = []
-        if not self._follow:
-            return found
-        gain = np.abs(self._parameters_response(poles)) ** 2
-        for j in range(1, len(passes)):
-            moved = np.fft.rfft(passes[j].commanded - passes[j - 1].commanded)
-            if not moved.any():
-                continue
-            squares = of_change(moved)
-            for k, (mode, begun) in enumerate(zip(self.modes, self.begun, strict=True)):
-                if begun.exact or mode.rate * self._size > RINGS_ON or not self.residues[k]:
-                    continue
-                below = int(mode.angle / (2.0 * np.pi) * self._size)
-                for harmonic in (below, below + 1):
-                    if 0 < harmonic < self._w.size - 1:
-                        size = math.sqrt(squares[harmonic] / max(gain[harmonic], LEAST_SQUARE))
-                        found.append(Tone(j, k, harmonic, max(size, LEAST_KICK)))
-        return found
-
-    def _tone_columns(self, tones: Sequence[Tone], poles: ModeAnswers, number: int, *, settled: bool) -> ComplexArray:
-        """Return the answers to tones in a pass, (K, 2 T), with or without what has settled."""
-        parts = [
-            poles.to_tone(one.mode, self._size, one.harmonic, number - one.number, settled=settled) for one in tones
-        ]
-        return np.concatenate(parts, axis=1) if parts else np.zeros((self._w.size, 0), dtype=np.complex128)
-
-    def _rung_on(self, poles: ModeAnswers, number: int) -> ComplexArray:
-        """Return what rings in a pass of what is known to ring, (K,), metres."""
-        rings = np.zeros(len(self.modes), dtype=np.complex128) + self.rings
-        for at, mode, ring in self.kicked:
-            rings[mode] += ring / self.modes[mode].step ** (at * self._size)
-        pairs = np.stack([rings.real, rings.imag], axis=1).ravel()
-        return np.asarray(poles.ringing(self._size, number)[:, : pairs.size] @ pairs)
-
-    def _parameters_response(self, poles: ModeAnswers) -> ComplexArray:
-        """Return the present estimate of the gain, (K,)."""
-        if self.parameters is None:
-            return np.ones(self._w.size, dtype=np.complex128)
-        response = self._response(self._w, poles)
-        return np.asarray(response[:, : self.parameters.size] @ self.parameters)
 
     def _response(self, w: FloatArray, poles: ModeAnswers) -> ComplexArray:
         """Return the frequency response of each parameter, (len(w), P), at `w` (rad/sample)."""
@@ -354,17 +282,16 @@ class Dynamics:
         """Return the spectrum of each parameter's answer to endless passes, (K, P)."""
         return np.asarray(self._response(self._w, poles) * np.fft.rfft(aim)[:, None])
 
-    def _joined(self, answers: ComplexArray, ringing: ComplexArray, tones: ComplexArray) -> ComplexArray:
-        """Return the columns of all parameters: samples, residues, moves of poles, ringing from before, tones."""
+    def _joined(self, answers: ComplexArray, ringing: ComplexArray) -> ComplexArray:
+        """Return the columns of all parameters: samples, residues, moves of poles, ringing from before."""
         both = 2 * len(self.modes)
         own, moves = answers[:, : self._taps + both], answers[:, self._taps + both :]
-        return np.concatenate([own, moves + ringing[:, both:], ringing[:, :both], tones], axis=1)
+        return np.concatenate([own, moves + ringing[:, both:], ringing[:, :both]], axis=1)
 
-    def _prior(self, poles: ModeAnswers, scale: float, tones: Sequence[Tone]) -> tuple[FloatArray, FloatArray]:
+    def _prior(self, poles: ModeAnswers, scale: float) -> tuple[FloatArray, FloatArray]:
         """Return information matrix and vector of what is known before the passes; `scale`: of ringing, metres."""
         none = np.zeros((self._guess_w.size, 4 * len(self.modes)), dtype=np.complex128)
-        nothing = np.zeros((self._guess_w.size, 2 * len(tones)), dtype=np.complex128)
-        guessed = self._joined(self._response(self._guess_w, poles), none, nothing)
+        guessed = self._joined(self._response(self._guess_w, poles), none)
         information, vector = normal(guessed, self._guess, 1.0 / self._guess_variance)
         # Of the samples nothing more is known.
         sds, means = [math.inf] * self._taps, [0.0] * self._taps
@@ -374,8 +301,6 @@ class Dynamics:
             exact = EXACT if mode.exact else 1.0
             sds += [exact * DECAY * begun.rate, exact * max(POLE * begun.angle, begun.unsure)]
         sds += [scale] * (2 * len(self.modes))
-        for one in tones:
-            sds += [one.size] * 2
         means += [0.0] * (2 * len(self.modes))
         for mode, begun in zip(self.modes, self.begun, strict=True):
             means += [0.0, 0.0] if mode.exact else [mode.rate - begun.rate, begun.angle - mode.angle]

@@ -23,21 +23,21 @@ REST_SHARE, TURN_SHARE = 0.1, 0.02
 # Random walk of the repeating error from pass to pass, as a share of its noise (variance).
 ERROR_WALK = 0.02
 # The share of an innovation that is taken over grows by the correlation of successive ones beyond this, which noise may
-# have, up to this share; what is left of the correlation after another pass.
-CORRELATED, MOST_SHARE, REMEMBERED = 0.1, 0.8, 0.7
+# have, up to this share.
+CORRELATED, MOST_SHARE = 0.1, 0.8
+# Shares of a new pass in what changes soon (what innovations have in common, what comes with a change of the path) and
+# in what changes slowly (noise, and what changes of one harmonic and of all say of its gain).
+SOON, SLOWLY = 0.3, 0.1
 # Share of an unexpected change, as in the neighbouring harmonics, that is taken for a change of the repeating error.
 CHANGED_SHARE, NEIGHBOURS = 0.2, 3
-# Share of the new estimate of what comes with a change of the path.
-SCATTER_SHARE = 0.3
-# Share that is left after another pass of a gain's variance by what was not foretold, and where nothing has tested it;
-# share of what the changes of one harmonic alone say of its gain.
-FORGOTTEN, KEPT, OWN_KEPT = 0.4, 0.9, 0.9
+# Share that is left after another pass of a gain's variance by what was not foretold, where it was tested again.
+FORGOTTEN = 0.4
 # Standard deviations by which what is read of the path itself is not explained, until its gain is not known.
 RIDDLE = 8.0
 # Most of that variance, as a multiple of that of the first guess.
 MOST_MISFIT = 4.0
-# A share of the noise's new estimate in each pass, of one harmonic and (by this number of harmonics) of the floor.
-NOISE_SHARE, FLOOR_COUNT = 0.1, 200.0
+# Number of harmonics from which on the floor of the noise has a whole share of a new pass.
+FLOOR_COUNT = 200.0
 # What is saved.
 HARMONICS_ARRAYS: Arrays = {
     **dict.fromkeys(("gain", "without", "covariance", "answered", "innovation", "answers"), (complex, ("harmonics",))),
@@ -231,7 +231,7 @@ class Harmonics:
         scatter = scattered * size
         if size > 0.0:
             new = beyond / (size + float(np.mean(self.noise[1:])))
-            scattered = scattered + SCATTER_SHARE * (new - scattered)
+            scattered = scattered + SOON * (new - scattered)
         # A gain that has not foretold the answer is not known, whatever is said of it. Small changes tell nothing.
         answered = around(np.abs(gain) ** 2 * squares)
         apart = around(np.abs(reading - (at_last + answer.gain * change)) ** 2)
@@ -239,12 +239,12 @@ class Harmonics:
         # Where mechanics cannot be, it is the hysteresis that has answered otherwise.
         most = np.minimum(np.abs(gain) ** 2, MOST_MISFIT * self.guessed)
         told = np.where(answered > noise, np.minimum(apart / np.maximum(around(squares), 1e-300), most), 0.0)
-        misfit = np.maximum(told, np.where(answered > noise, FORGOTTEN, KEPT) * self.misfit)
+        misfit = np.maximum(told, np.where(answered > noise, FORGOTTEN, 1.0 - SLOWLY) * self.misfit)
         weight = 1.0 / (noise + before + moved + scattered * size)
         found = replace(
             self,
-            changed=OWN_KEPT * self.changed + weight * squares,
-            answers=OWN_KEPT * self.answers + weight * change.conj() * (reading - at_last),
+            changed=(1.0 - SLOWLY) * self.changed + weight * squares,
+            answers=(1.0 - SLOWLY) * self.answers + weight * change.conj() * (reading - at_last),
         )
         joint, joint_variance = found._joint(answer, misfit)
         answer = replace(answer, gain=joint, variance=joint_variance)
@@ -276,9 +276,9 @@ class Harmonics:
         upper = ratio[ratio.size // 2 :]
         # Of an exponential distribution, the median is log 2.
         level = float(np.median(upper)) / np.log(2.0)
-        share = min(upper.size / FLOOR_COUNT, 1.0) * max(NOISE_SHARE, 0.5 / self.passes)
+        share = min(upper.size / FLOOR_COUNT, 1.0) * max(SLOWLY, 0.5 / self.passes)
         floor = float(self.noise.min()) * float(np.clip(level, 0.25, 4.0)) ** share
-        own = self.noise * (1.0 + NOISE_SHARE * (np.clip(ratio, 0.0, 4.0) - 1.0))
+        own = self.noise * (1.0 + SLOWLY * (np.clip(ratio, 0.0, 4.0) - 1.0))
         return np.asarray(np.maximum(own, floor))
 
     def step(self, correction: ComplexArray, desired: ComplexArray, gain: float) -> ComplexArray:
@@ -316,7 +316,7 @@ def _share(share: FloatArray, correlation: FloatArray) -> FloatArray:
 
 def _mean_with(before: FloatArray, new: FloatArray) -> FloatArray:
     """Return a mean over the last passes after another one."""
-    return np.asarray(REMEMBERED * before + (1.0 - REMEMBERED) * new)
+    return np.asarray((1.0 - SOON) * before + SOON * new)
 
 
 def around(power: FloatArray) -> FloatArray:

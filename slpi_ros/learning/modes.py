@@ -103,31 +103,6 @@ class ModeAnswers:
             moves += [moved.real, -moved.imag]
         return columns([np.fft.rfft(x) for x in own + moves], size // 2 + 1)
 
-    def to_tone(self, mode: int, size: int, harmonic: int, passes: int, *, settled: bool) -> ComplexArray:
-        """Return the spectrum in a pass, (K, 2), of a mode's answer to a harmonic (1, and j) of an earlier pass.
-
-        `passes`: number of passes since the harmonic has begun, below 0 before it. Without `settled`: only what of the
-        answer dies away.
-        """
-        found = np.zeros((size // 2 + 1, 2), dtype=np.complex128)
-        if passes < 0:
-            return found
-        ring = ModeAnswers(self.modes[mode : mode + 1], self.residues[mode : mode + 1], np.zeros(1, complex))
-        spectra = ring.ringing(size, passes)[:, :2]
-        for k, unit in enumerate((1.0, 1j)):
-            kick = self.kick(mode, size, harmonic, unit)
-            found[:, k] = spectra @ np.array([kick.real, kick.imag])
-            if settled:
-                response = ring.response(np.array([2.0 * np.pi * harmonic / size]))[0, :2]
-                found[harmonic, k] += unit * (response @ np.array([self.residues[mode].real, self.residues[mode].imag]))
-        return found
-
-    def kick(self, mode: int, size: int, harmonic: int, spectrum: complex) -> complex:
-        """Return what rings (m) from the beginning of a harmonic on (m, sum over the samples of a pass) with a mode."""
-        step, turn = self.modes[mode].step, complex(np.exp(-2j * np.pi * harmonic / size))
-        up, down = step * turn / (1.0 - step * turn), step / turn / (1.0 - step / turn)
-        return -complex(self.residues[mode]) * (spectrum * up + spectrum.conjugate() * down) / size
-
 
 def columns(parts: Sequence[ComplexArray], size: int) -> ComplexArray:
     """Return columns (size,) side by side, also none."""

@@ -63,16 +63,17 @@ def test_a_mode_is_found_or_refined_and_its_transient_is_told(told):
 
 
 def test_columns_of_a_mode_are_its_answers():
-    mode = Mode.of(HERTZ, DAMPING, DT)
-    answers = ModeAnswers((mode,), np.array([0.3 - 0.2j]), np.array([0j]))
-    tone = np.cos(2 * np.pi * 8 * np.arange(SIZE) / SIZE)
-    after = answers.answers([np.zeros(SIZE), tone, tone, tone], 0)
-    for passed in range(3):
-        expected = after[1 + passed][:, :2] @ np.array([0.3, -0.2])
-        # A harmonic of 1 is half a cosine, over the samples.
-        found = answers.to_tone(0, SIZE, 8, passed, settled=True)[:, 0] * (SIZE / 2)
-        assert np.abs(found - expected).max() < 1e-9 * np.abs(expected).max()
-    assert not answers.to_tone(0, SIZE, 8, -1, settled=True).any()
+    mode, residue, rng = Mode.of(HERTZ, DAMPING, DT), 0.3 - 0.2j, np.random.default_rng(3)
+    answers = ModeAnswers((mode,), np.array([residue]), np.array([0j]))
+    commanded = rng.normal(size=(3, SIZE))
+    impulse = np.real(residue * mode.step ** np.arange(3 * SIZE))
+    expected = np.convolve(commanded.ravel(), impulse)[: 3 * SIZE].reshape(3, SIZE)
+    for found, one in zip(answers.answers(list(commanded), 0), expected, strict=True):
+        assert found[:, :2] @ [residue.real, residue.imag] == pytest.approx(np.fft.rfft(one), rel=1e-9)
+    # What rings from before changes by the pole from one pass to the next.
+    first, second = (np.fft.irfft(answers.ringing(SIZE, number)[:, 0], SIZE) for number in (0, 1))
+    assert first == pytest.approx(np.real(mode.step ** np.arange(SIZE)))
+    assert second == pytest.approx(np.real(mode.step ** (SIZE + np.arange(SIZE))))
 
 
 def test_candidates_leave_out_what_is_known():

@@ -341,9 +341,11 @@ def test_another_model_begins_anew_from_the_correction_of_the_path(model):
     for wrong in (slpi_ros.Learner(stranger, t, desired), slpi_ros.Learner(model, t, desired * 1.001)):
         with pytest.raises(ModelError):
             wrong.resume(document)
-    for broken in ({}, {**document, "axes": {}}, {**document, "schema": "slpi_ros/learned/9"}):
+    for broken in ({}, {**document, "axes": {}}, {**document, "schema": 2}):
         with pytest.raises(ModelError):
             again.resume(broken)
+    with pytest.raises(ModelError, match="learned/1.*learn the path again"):
+        again.resume({"schema": "slpi_ros/learned/1", "axes": {}})
     learner.forget()
     assert np.array_equal(learner.path(), desired)
 
@@ -558,8 +560,7 @@ def test_options_that_make_no_sense_are_refused(model, options):
     [
         (("harmonics", "noise"), lambda x: [0.0] * len(x)), (("harmonics", "noise"), lambda x: [1e300] * len(x)),
         (("deviating",), lambda _: [10**30]), (("hashes",), lambda x: [x[0].split(":")[0]]),
-        (("dynamics", "kicks"), lambda _: [[-50, 0.5, 1.0, 1.0]]),
-        (("dynamics", "kicks"), lambda _: [[1, 10**9, 1.0, 1.0]]),
+        (("dynamics", "modes"), lambda x: [*x, [0.1, 0.5, 0.0]]), (("dynamics", "rings"), lambda _: [[1.0, 1.0]] * 9),
         (("dynamics", "residues"), lambda x: [*x, [1.0, 1.0]]),
         (("dynamics", "parameters"), lambda _: [1.0]), (("dynamics", "carried"), lambda _: [[1.0, 1.0, 2.0]]),
         (("dynamics", "oldest"), lambda _: [[1.0]]), (("best", "number"), lambda _: 10**18),

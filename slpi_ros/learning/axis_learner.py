@@ -30,6 +30,8 @@ WORSE, WORSE_BY_NOISE, UNSURE = 1.1, 4.0, 3.0
 MOST_RETURNS, MOST_REFUSED = 2, 3
 # How a text begins and ends that says why learning is held.
 HELD, ANEW = "held", "forget what was learned to begin again"
+# Passes after which the best one is forgotten: of hundreds, one is better by luck.
+BEST_PASSES = 50
 # Largest part of the stroke that learning may add to the desired path, by default.
 LIMIT_SHARE = 0.25
 # Readings further from the path than this many strokes are none.
@@ -274,6 +276,8 @@ class AxisLearner:
         mean variance of that. What is transient may be wrong: a better pass has to be so with it and without it.
         """
         number, power, best = len(self.passes) + 1, max(steady, rms**2), self.best
+        if best is not None and number - best.number > BEST_PASSES:
+            best = None
         if best is not None and self.returned:
             return self._settled_again(best, clean, rms**2)
         self.returned = False

@@ -86,7 +86,7 @@ def _errors(outcome: Outcome) -> list[list[str]]:
         [
             step.name,
             axis,
-            "with the causes found" if number else "hysteresis alone",
+            "with the causes found" if number and outcome.diagnosis.axes[axis].effects else "hysteresis alone",
             length(error.mean),
             f"{error.mean / error.stroke:.3%}",
             *map(length, (error.maximum, error.offset, error.rest)),

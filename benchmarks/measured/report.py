@@ -61,7 +61,8 @@ def readme_table(rows: Rows, manifest: Manifest, date: str, command: str) -> str
         f"| device, judged on | {' | '.join(COLUMNS)} | best of the other methods |",
         f"|---|{'---|' * len(COLUMNS)}---|",
     ]
-    for label, name in by_device(rows, manifest).items():
+    shown = by_device(rows, manifest)
+    for label, name in shown.items():
         row, marked = rows[label], marks(rows[label])
         cells = [_cell(row.get(column, {}), marked.get(column, "")) for column in COLUMNS]
         others = {other: cell for other, cell in row.items() if other not in COLUMNS and "rms" in cell}
@@ -75,7 +76,7 @@ def readme_table(rows: Rows, manifest: Manifest, date: str, command: str) -> str
         f"difference to it (95 %), however large it looks where a record has few cycles. One row for each device that "
         f"moves: of its rows the one with the median ratio of *SLPI, causes* to the best other method, of two the "
         f"worse.\n\n"
-        f"{headline(rows, by_device(rows, manifest))} [All {len(rows)} rows, all methods, with intervals]"
+        f"{headline(rows, shown)} [All {len(rows)} rows, all methods, with intervals]"
         f"(docs/explanation/measured.md)."
     )
     return "\n".join([*lines, "", said])

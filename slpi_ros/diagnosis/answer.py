@@ -119,9 +119,13 @@ class Judge:
 
     def _best_without(self, now: JointFit, name: str) -> JointFit:
         fit = now.without(name).refined(CONVERGED)
-        same = [one for one in self._search.pool.values() if one.names == EffectSet.of(fit).names]
-        known = min(same, key=lambda one: one.loss.square, default=None)
+        known = self._tried(EffectSet.of(fit).names)
         return fit if known is None or known.loss.square >= fit.held_out.square else self._rebuilt(known)
+
+    def _tried(self, names: tuple[str, ...]) -> EffectSet | None:
+        """Return the best one of the sets with these names, sorted, that were tried."""
+        same = [one for one in self._search.pool.values() if one.names == names]
+        return min(same, key=lambda one: one.loss.square, default=None)
 
     def _senseless(self, now: JointFit) -> list[str]:
         """Return the effects that explain too little of what is there where they act."""
@@ -160,12 +164,11 @@ class Judge:
 
     def _may_make_sense(self, fitted: EffectSet) -> bool:
         """Return whether each effect of a set explains enough, as far as the sets without it were tried."""
-        least = {one.names: one.loss for one in sorted(self._search.pool.values(), key=lambda one: -one.loss.square)}
         for name in {*fitted.names} - {*self._search.fixed}:
             names = list(fitted.names)
             names.remove(name)
-            rest = least.get(tuple(names))
-            if rest is None or share(fitted.loss, rest, self._noise) < EXPLAINED:
+            rest = self._tried(tuple(names))
+            if rest is None or share(fitted.loss, rest.loss, self._noise) < EXPLAINED:
                 return False
         return True
 

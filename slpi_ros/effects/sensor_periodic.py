@@ -69,7 +69,7 @@ class SensorPeriodic(EffectBase):
         "m", "period in displacement, such as half a wavelength", 1e-12, 1e3,
         fit=Fit("relative", lambda value, _: 1e-5 * abs(value), SHORTEST, LONGEST),
     )  # fmt: skip
-    amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0, size=True))
+    amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0, most=LONGEST, size=True))
     phase: float = parameter("rad", "phase at displacement 0", -1e3, 1e3, fit=Fit("angle", 1e-4))
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 

@@ -21,7 +21,6 @@ from diagnostic_msgs.msg import DiagnosticArray
 from numpy.typing import NDArray
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
-from std_srvs.srv import Trigger
 
 import slpi_ros
 from benchmarks import kept
@@ -145,15 +144,17 @@ class Readme:
             self.finish(words, self.start(words))
         return slpi_ros.load_model(self.folder / "my_stage" / "model.json")
 
-    def compensator(self, more: str = "") -> subprocess.Popen[bytes]:
-        """Start the compensator and wait until its topics are visible."""
-        process = self.start("ros2 run slpi_ros compensator", more)
+    def compensator(self) -> subprocess.Popen[bytes]:
+        """Start the compensator and wait until its topics are visible and its reset has ended."""
+        self.memory = ""
+        process = self.start("ros2 run slpi_ros compensator")
         self.until(
             lambda: (
                 self.node.count_subscribers("/desired_displacement") and self.node.count_publishers("/voltage_command")
             ),
             "the compensator",
         )
+        self.until(lambda: self.memory == "known", "the end of the reset")
         return process
 
     def errors(self, model: slpi_ros.StageModel) -> FloatArray:
@@ -193,15 +194,6 @@ class Readme:
         self.node.destroy_publisher(publisher)
         return 100.0 * np.array(found) / (high - low)
 
-    def reset(self) -> None:
-        """Call the service ``reset_memory`` of the compensator and wait for its response."""
-        client = self.node.create_client(Trigger, "/compensator/reset_memory")
-        self.until(client.service_is_ready, "reset_memory")
-        answer = client.call_async(Trigger.Request())
-        self.until(answer.done, "the end of the reset")
-        assert answer.result().success, answer.result().message
-        self.node.destroy_client(client)
-
     def warnings(self) -> list[str]:
         """Return the warnings and errors in the output of the compensator."""
         lines = self.console("ros2 run slpi_ros compensator").read_text().splitlines()
@@ -220,11 +212,9 @@ def as_written(user: Readme, seed: int) -> tuple[slpi_ros.StageModel, FloatArray
 
 
 def next_day(user: Readme, seed: int, model: slpi_ros.StageModel) -> tuple[FloatArray, list[str]]:
-    """Restart the stage one day later, and the compensator with ``reset_on_start``; return errors and warnings."""
+    """Restart the stage one day later, and the compensator; return errors and warnings."""
     stage = user.stage(seed, f"-p initial_state:='{[round(v, 6) for v in user.turns]}'")
-    compensator = user.compensator("-p reset_on_start:=true")
-    user.memory = ""
-    user.until(lambda: user.memory == "known", "the reset")
+    compensator = user.compensator()
     errors = user.errors(model)
     user.interrupt(compensator)
     user.interrupt(stage)
@@ -232,7 +222,7 @@ def next_day(user: Readme, seed: int, model: slpi_ros.StageModel) -> tuple[Float
 
 
 def moved(user: Readme, seed: int, model: slpi_ros.StageModel, history: str, to: float) -> None:
-    """Print the errors of a stage that was driven through `history` (V) to `to` (V) before the compensator measures."""
+    """Print the errors of a stage that was driven through `history` (V) to `to` (V) before the compensator starts."""
     stage = user.stage(seed, f"-p initial_state:='{history}'")
     voltages = user.node.create_publisher(Float64MultiArray, "/voltage_command", 100)
     user.until(voltages.get_subscription_count, "the stage")
@@ -242,14 +232,11 @@ def moved(user: Readme, seed: int, model: slpi_ros.StageModel, history: str, to:
         voltages.publish(Float64MultiArray(data=[to]))
         user.spin(0.1)
     compensator = user.compensator()
-    user.spin(5 * SETTLE_S)
-    before = user.errors(model)
-    user.reset()
-    after = user.errors(model)
+    errors = user.errors(model)
     user.interrupt(compensator)
     user.interrupt(stage)
     user.node.destroy_publisher(voltages)
-    print(f"  driven through {history} V, at {to:g} V: {shown(before)}; after ~/reset_memory {shown(after)}")
+    print(f"  driven through {history} V, at {to:g} V: {shown(errors)}")
     for line in user.warnings():
         print(f"    {line}")
 
@@ -270,7 +257,7 @@ def main() -> None:
     os.environ["ROS_AUTOMATIC_DISCOVERY_RANGE"] = "LOCALHOST"
     os.environ.setdefault("ROS_DOMAIN_ID", str(60 + os.getpid() % 40))
     rclpy.init()
-    print("errors at five set points, % of stroke: as written, without reset | next day, with reset_on_start")
+    print("errors at five set points, % of stroke: as written | next day")
     found: list[FloatArray] = []
     for seed in options.seeds:
         with tempfile.TemporaryDirectory() as folder:

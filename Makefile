@@ -42,7 +42,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test test-long test-jazzy test-newest test-kilted test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-twins bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-recorder bench-oscillation bench-tune bench-export bench-coverage bench-identification test-export-arm bench-company FORCE
+.PHONY: help build test test-long test-jazzy test-newest test-kilted test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-twins bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-recorder bench-oscillation bench-tune bench-export bench-coverage bench-identification bench-diagnosis-speed test-export-arm bench-company FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -57,6 +57,7 @@ help:
 	@echo 'make demo       build, then a simulated stage is calibrated and follows a path; SEED= repeats one'
 	@echo 'make bench      build, then the benchmarks; ratios that have grown by more than 20 % are marked'
 	@echo 'make bench-identification  time, memory and results of identifications beside another commit; BESIDE=built clone'
+	@echo 'make bench-diagnosis-speed  time and memory of diagnoses beside another commit, 5 minutes; BESIDE=built clone'
 	@echo 'make bench-robustness  spoiled records beside clean ones, 8 seeds, 2 minutes'
 	@echo 'make bench-diagnosis   hidden effects: named, missed, invented; about an hour'
 	@echo 'make bench-records     what is found on some measured records, judged on others; half an hour'
@@ -152,6 +153,9 @@ bench: build
 
 bench-identification: build
 	$(VENV) benchmarks/identification_speed.py --measured $(if $(BESIDE),--beside $(BESIDE))
+
+bench-diagnosis-speed: build
+	$(VENV) benchmarks/diagnosis_speed.py --beside $(BESIDE)
 
 bench-robustness: build
 	$(VENV) benchmarks/robustness.py

@@ -230,7 +230,9 @@ class Judge:
             if as_good and (unproved and other.courses or fewer and not (single and other.keys and effect.courses)):
                 better.append(fit)
             if numbers <= own or alone:
-                as_good = as_good or (alone and self._beats(fit.held_out, rest.held_out))
+                # What both leave where they differ says nothing of which one is the cause.
+                refuted = not as_good and share(now.held_out, fit.held_out, self._noise) >= EXPLAINED
+                as_good = not refuted or (alone and self._beats(fit.held_out, rest.held_out))
                 rivals.append(Rival(label, fit.held_out, as_good))
         better.sort(key=lambda fit: (EffectSet.of(fit).numbers, fit.held_out.square))
         return next((fit for fit in better if not self._senseless(fit)), None), tuple(rivals)

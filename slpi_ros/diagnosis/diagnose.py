@@ -174,7 +174,8 @@ def _diagnose_axis(
     source = ", ".join(part.source for part in evidence.parts)
     given = _given(model, runs, found)
     extension = _extension(model, found, given, source)
-    while extension and not _carries_over(extension.judged, runs):
+    opponents = _opponents(model, found.base, runs, source) if extension else []
+    while extension and not _carries_over(extension.judged, opponents):
         # What makes a record worse is neither named nor in the model.
         if not found.named:
             extension = None
@@ -243,9 +244,29 @@ def _runs(model: AxisModel, now: JointFit, *, own: bool = False) -> list[FreeRun
     return runs
 
 
-def _carries_over(after: Sequence[FreeRun], runs: Sequence[FreeRun]) -> bool:
-    """Return whether the free runs of an extended model are worse than those of the given one on no record."""
-    return all(one.rms <= NO_WORSE * before.rms for one, before in zip(after, runs, strict=True))
+def _opponents(model: AxisModel, base: JointFit, runs: Sequence[FreeRun], source: str) -> list[float]:
+    """Return the errors (m, rms) on each record that an extended model must not exceed: those of the given model.
+
+    A model of some of the records has fitted what is peculiar to these; on them it counts as fitted to all records.
+    """
+    own = _own(model, base.evidence)
+    if own.all() or not own.any():
+        return [run.rms for run in runs]
+    refitted = _runs(_extended(model, base, source), base, own=True)
+    return [
+        max(run.rms, other.rms) if of_model else run.rms
+        for run, other, of_model in zip(runs, refitted, own.tolist(), strict=True)
+    ]
+
+
+def _own(model: AxisModel, evidence: Evidence) -> Mask:
+    """Return which records the model was identified from, mask of shape (records,)."""
+    return np.array([part.source in model.quality.sources for part in evidence.parts])
+
+
+def _carries_over(after: Sequence[FreeRun], opponents: Sequence[float]) -> bool:
+    """Return whether the free runs of an extended model exceed errors (m, rms) on no record."""
+    return all(one.rms <= NO_WORSE * before for one, before in zip(after, opponents, strict=True))
 
 
 def _answer(base: JointFit, of_family: Evidence | None) -> Answer:
@@ -305,8 +326,7 @@ def _given(model: AxisModel, runs: Sequence[FreeRun], answer: Answer) -> Given:
     """Compare the given model with the records; raise IdentificationError if it belongs to another stage."""
     evidence = answer.now.evidence
     motion = float(np.ptp(evidence.y[evidence.used]))
-    sources = model.quality.sources
-    own = np.array([part.source in sources for part in evidence.parts])
+    own = _own(model, evidence)
     rms = rms_of(runs)
     if own.any() and not own.all():
         # Some effects within each record would also explain a gain that has changed between records.
@@ -316,7 +336,7 @@ def _given(model: AxisModel, runs: Sequence[FreeRun], answer: Answer) -> Given:
     else:
         compared = [_compared(model.hysteresis_only, one) for one in (answer.base, answer.now)]
     # Records of the same name may be different ones; then the error differs from the stored one.
-    own_rms = model.quality.rms if own.all() and len(sources) == own.size else 0.0
+    own_rms = model.quality.rms if own.all() and len(model.quality.sources) == own.size else 0.0
     compared = [replace(one, rms=rms, motion=motion, own_rms=own_rms) for one in compared]
     # Effects alter the fitted hysteresis, so the stage has changed only if both comparisons, without effects and with
     # them, show it.

@@ -345,6 +345,15 @@ def findings(quality: Quality) -> list[Finding]:
     ]
 
 
+def missing_samples(record: Record) -> tuple[Finding, ...]:
+    """Return what the stamps of a record tell of samples that it lacks, whichever axis moved; empty: none."""
+    clocks = []
+    for v in record.voltage.values():
+        known = v[np.isfinite(v)]
+        clocks.append(_clock(record.t, v, NEAR_END * float(np.ptp(known)) if known.size else 0.0))
+    return tuple(_missing_findings(max(clocks, key=lambda clock: clock.unseen)))
+
+
 def require_usable(found: Iterable[Finding], where: str) -> None:
     """Raise IdentificationError for the first finding of level "stop"; its message begins with `where`."""
     for finding in found:
@@ -365,6 +374,12 @@ def _clock_findings(clock: ClockQuality) -> Iterator[Finding]:
     text = f"{clock.samples} samples in {clock.duration:.6g} s, {1.0 / period:.5g} per second"
     jitter = clock.jitter / period
     yield _warn_if(jitter > _JITTER, f"{text}, jitter {jitter:.1%} of the period", "lags will be uncertain")
+    yield from _missing_findings(clock)
+    if clock.duplicates:
+        yield Finding("warn", f"{_of(clock.duplicates, clock.samples)} with the stamp of the one before")
+
+
+def _missing_findings(clock: ClockQuality) -> Iterator[Finding]:
     if clock.lost:
         text = f"{clock.lost} samples missing between {clock.samples} others, {clock.longest_gap:.4g} s at most"
         yield Finding("warn", text)
@@ -372,8 +387,6 @@ def _clock_findings(clock: ClockQuality) -> Iterator[Finding]:
         yield Finding(
             "warn", f"{clock.unseen} gaps within which the voltage moved: unseen reversals leave the memory uncertain"
         )
-    if clock.duplicates:
-        yield Finding("warn", f"{_of(clock.duplicates, clock.samples)} with the stamp of the one before")
 
 
 def _held(quality: Quality) -> Iterator[Finding]:

@@ -61,6 +61,8 @@ METHODS = ("PI", "line", "inverse")
 # Passes with feedback, and the most samples of them.
 FEEDBACK_PASSES, MOST_SAMPLES = 5, 30_000
 PATHS = ("raster 1", "raster 5", "raster 20", "raster 40", "raster f/10", "sine", "steps", "free")
+# The path of the row that `--keep` writes.
+KEPT_PATH = "raster 20"
 # Of steps: levels, as shares of half the path; rise (s), time constants of the mode until they count, and how long they
 # count then (s).
 LEVELS, RISE_S, SETTLING, COUNTED_S = (0.6, -0.4, 0.9, -0.8, 0.0), 0.02, 5.0, 0.04
@@ -331,18 +333,23 @@ def compare(
     return errors
 
 
-def keep(specimen: Specimen, seed: int, passes: int, errors: Mapping[str, Any]) -> None:
-    """Keep the row of a raster that repeats."""
+def keep(stages: Mapping[int, tuple[Specimen, Mapping[str, Any]]], passes: int) -> None:
+    """Keep the row of a raster that repeats: median and range over stages, by seed, and their errors (nm)."""
+    specimens, errors = zip(*stages.values(), strict=True)
+    modes = [one.frequency for one in specimens]
+    noise = [1e9 * one.noise for one in specimens]
     what = (
-        f"a raster of 20 Hz that repeats, simulated stage with a mode of {specimen.frequency:.0f} Hz and "
-        f"{1e9 * specimen.noise:.1f} nm of sensor noise, rms error: inverse alone; proportional-integral "
-        f"feedback; `learn` after {passes} passes; learning without a model of the dynamics: from a straight line, "
-        "from the inverse"
+        f"a raster of 20 Hz that repeats, {len(stages)} simulated stages with modes of {min(modes):.0f} to "
+        f"{max(modes):.0f} Hz and {min(noise):.0f} to {max(noise):.0f} nm of sensor noise, rms error, median (least to "
+        f"largest): inverse alone; proportional-integral feedback; `learn` after {passes} passes; learning without a "
+        "model of the dynamics: from a straight line, from the inverse (this and the feedback with the best of several "
+        "gains)"
     )
-    last = {each: errors[each][-1] for each in ("PI", "learner", "line", "inverse")}
-    figures = [errors["learner"][0], *last.values()]
-    said = "; ".join(f"{one:.1f} nm" for one in figures)
-    kept.write_row("learning", what, said, f'make bench-learning LEARNING="--seed {seed} --count 1"')
+    columns = [[one["learner"][0] for one in errors]]
+    columns += [[one[method][-1] for one in errors] for method in ("PI", "learner", "line", "inverse")]
+    said = "; ".join(f"{np.median(each):.3g} ({min(each):.3g} to {max(each):.3g}) nm" for each in columns)
+    chosen = f"--seed {min(stages)} --count {len(stages)} --paths '{KEPT_PATH}'"
+    kept.write_row("learning", what, said, f'make bench-learning LEARNING="{chosen}"')
 
 
 def main() -> int:
@@ -356,7 +363,7 @@ def main() -> int:
     parser.add_argument("--beside", nargs="*", choices=METHODS, default=METHODS, help="what else to run; default: all")
     parser.add_argument("--models", type=Path, help="folder in which identified models are kept")
     parser.add_argument("-v", action="store_true", help="tell what happened in which pass")
-    parser.add_argument("--keep", action="store_true", help=f"write the row of the first raster 20 to {kept.KEPT.name}")
+    parser.add_argument("--keep", action="store_true", help=f"write the row of {KEPT_PATH} to {kept.KEPT.name}")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     print(f"true error, rms nm, without mean; after 5 and {options.passes} passes")
@@ -364,6 +371,7 @@ def main() -> int:
           f"{'line 5':>8}{'last':>8}{'inv. 5':>8}{'last':>8}{'own 5':>10}{'last':>8}")  # fmt: skip
     counts = {"NOISE": 0, "TENTH": 0, "LINE": 0, "HARM": 0, "HARM (alone too)": 0}
     rows = 0
+    stages: dict[int, tuple[Specimen, Mapping[str, Any]]] = {}
     for seed in range(options.seed, options.seed + options.count):
         specimen = Specimen.draw(seed)
         began = time.perf_counter()
@@ -390,14 +398,16 @@ def main() -> int:
                 counts["HARM (alone too)"] += 1
                 marks.append("(alone too)")
             rows += 1
-            if options.keep and name == "raster 20" and seed == options.seed:
-                keep(specimen, seed, options.passes, errors)
+            if name == KEPT_PATH:
+                stages[seed] = specimen, errors
             others = [errors.get(method, [math.nan] * options.passes) for method in ("line", "inverse")]
             beside = "".join(f"{each[fifth]:>8.1f}{each[-1]:>8.1f}" for each in others)
             print(f"{'':<34}{name:<12}{noise:>6.1f}{own[0]:>8.1f}{errors.get('PI', [math.nan])[-1]:>8.1f}{beside}"
                   f"{own[fifth]:>10.1f}{own[-1]:>8.1f}  {errors['limited'][0]}"
                   f" {errors['bandwidth'][0]:.0f} Hz"
                   f"  {' '.join(marks)}", flush=True)  # fmt: skip
+    if options.keep and stages:
+        keep(stages, options.passes)
     print("; ".join(f"{mark} {count} of {rows}" for mark, count in counts.items()))
     return 1 if counts["NOISE"] > 0.1 * rows or counts["TENTH"] or counts["LINE"] or counts["HARM"] else 0
 

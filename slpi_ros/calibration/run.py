@@ -22,6 +22,7 @@ from slpi_ros.excitation.drives import CALIBRATION as CALIBRATION_DRIVE
 from slpi_ros.excitation.drives import SWEEP, Drive
 from slpi_ros.identification.held_readings import slower_sensor, without_held
 from slpi_ros.identification.progress import listening
+from slpi_ros.identification.record_quality import Finding, missing_samples
 from slpi_ros.identification.signal_statistics import noise
 from slpi_ros.io.record import Record
 from slpi_ros.io.stage_name import same_stage
@@ -112,6 +113,7 @@ class Step:
     why: str
     finding: str = ""
     errors: Mapping[str, TrackingError] | None = None  # of a verification
+    missing: tuple[Finding, ...] = ()  # samples that its record lacks
 
 
 @dataclass(frozen=True)
@@ -145,6 +147,7 @@ class Progress:
     step: int
     seconds_left: float  # for drives
     error: float | None  # m, the largest mean error in the latest verification
+    missing: tuple[Finding, ...] = ()  # samples that the record of the step, just made, lacks
 
 
 Recorder = Callable[[Request], Recording]
@@ -223,11 +226,22 @@ class _Calibration:
         """Sum of the durations of all drives so far, seconds."""
         return sum(step.seconds for step in self._steps)
 
-    def _begin(self, doing: str) -> None:
+    def _begin(self, doing: str, missing: tuple[Finding, ...] = ()) -> None:
         errors = self._verified[-1][1] if self._verified else {}
         worst = max((error.mean for error in errors.values()), default=None)
         left = max(self._settings.budget - self._used, 0.0)
-        self._report(Progress(doing, len(self._steps) + 1, left, worst))
+        self._report(Progress(doing, len(self._steps) + 1, left, worst, missing))
+
+    def _did(
+        self,
+        record: Record,
+        drive: Drive,
+        why: str,
+        finding: str,
+        errors: Mapping[str, TrackingError] | None = None,
+    ) -> None:
+        """Note the step of a drive."""
+        self._steps.append(Step(record.source, float(drive.t[-1]), why, finding, errors, missing_samples(record)))
 
     def _recorded(
         self,
@@ -242,6 +256,8 @@ class _Calibration:
         if recording.kept:
             fitted = kind not in (CHECK_DRIVE, SWEEP, LOOP_DRIVE)
             require_kept(recording.record, drive, self._settings, self._first, fitted=fitted)
+        if missing := missing_samples(recording.record):
+            self._begin(f"recorded {name}", missing)
         if self._settings.accept_stage and same_stage(recording.record.hardware_id, self._settings.accept_stage):
             recording = replace(recording, record=replace(recording.record, hardware_id=""))
         return recording
@@ -253,16 +269,14 @@ class _Calibration:
         with naming(record) if recording.kept else nullcontext():
             findings = [_follows(axis, drive, record, self._settings) for axis in self._settings.axes]
         self._first = record
-        self._steps.append(Step(record.source, float(drive.t[-1]), drive.why, "; ".join(findings)))
+        self._did(record, drive, drive.why, "; ".join(findings))
 
     def _sweep(self) -> None:
         """Sweep all axes, so that those that wait for their turn in the calibration drive rest in a known state."""
         axes = self._settings.axes
         drive = exciting(self._settings, SWEEP, SWEEP_SECONDS * len(axes), axes, self._settings.seed)
         record = self._recorded(SWEEP, drive, {}).record
-        self._steps.append(
-            Step(record.source, float(drive.t[-1]), "an axis that waits rests in a known state", drive.why)
-        )
+        self._did(record, drive, "an axis that waits rests in a known state", drive.why)
 
     def _excite(self, kind: str, axes: Sequence[str], seconds: float, why: str) -> None:
         drive = exciting(self._settings, kind, seconds, axes, self._settings.seed + len(self._steps))
@@ -272,7 +286,7 @@ class _Calibration:
         period = float(np.median(np.diff(record.t)))
         held = {axis: without_held(record, axis)[1] for axis in axes}
         slow = [f"axis {axis}: {slower_sensor(rows, period)}" for axis, rows in held.items() if rows > 1.0]
-        self._steps.append(Step(record.source, float(drive.t[-1]), why, "; ".join([drive.why, *slow])))
+        self._did(record, drive, why, "; ".join([drive.why, *slow]))
 
     def _identify(self) -> StageModel:
         self._begin("identifying the hysteresis")
@@ -330,7 +344,7 @@ class _Calibration:
         )
         model = model.shifted(moved)
         self._records.append(recording.record)
-        self._steps.append(Step(recording.record.source, float(drive.t[-1]), drive.why, finding, errors))
+        self._did(recording.record, drive, drive.why, finding, errors)
         self._verified.append((model, errors))
         return errors
 
@@ -370,8 +384,11 @@ class _Calibration:
                 found[name] = replace(one, told=told, steps=steps)
             self._records.append(recording.record)
         finding = "; ".join(f"axis {name}: {one.told}" for name, one in found.items())
-        name, seconds = (self._records[-1].source, float(drive.t[-1])) if shown else ("tune", 0.0)
-        self._steps.append(Step(name, seconds, "feedback of the largest bandwidth: steps and a raster", finding))
+        why = "feedback of the largest bandwidth: steps and a raster"
+        if shown:
+            self._did(recording.record, drive, why, finding)
+        else:
+            self._steps.append(Step("tune", 0.0, why, finding))
         return found
 
 

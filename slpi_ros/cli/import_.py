@@ -29,7 +29,8 @@ def _add_options(command: ArgumentParser) -> None:
     )
     command.add_argument(
         "--voltage", metavar="COLUMN", nargs="+", default=(),
-        help="one for all axes or one per axis; default: the columns in volts",
+        help="commanded or measured, at the times of the rows; one for all axes or one per axis; default: the columns "
+        "in volts",
     )  # fmt: skip
     command.add_argument(
         "--displacement", metavar="COLUMN", nargs="+", default=(),

@@ -142,8 +142,10 @@ def add_topics(command: ArgumentParser) -> None:
     clocks = ("displacement", "voltage")
     command.add_argument("--clock", choices=clocks, help=f"for separate topics: sample times; default: {clocks[0]}")
     command.add_argument(
-        "--voltage-measured", action="store_true", help="voltage is measured: interpolate it; default: hold it"
-    )
+        "--voltage-measured", action="store_true",
+        help="for separate topics: the voltage is measured, and interpolated between its messages; default: it is "
+        "commanded, and held until the next one",
+    )  # fmt: skip
 
 
 def add_with(command: ArgumentParser, default: str) -> None:
@@ -207,7 +209,10 @@ def _topics_of(options: Namespace) -> "str | SeparateTopics":
         held = not options.voltage_measured
         return SeparateTopics(voltage, displacement, clock=options.clock or "displacement", held=held)
     if options.clock or options.voltage_measured:
-        raise UsageError("--clock and --voltage-measured require --voltage-topic and --displacement-topic; give both")
+        raise UsageError(
+            "--clock and --voltage-measured are for --voltage-topic and --displacement-topic: give both topics; where "
+            "one message holds both signals, as in imported tables, leave these options out, whatever the voltage is"
+        )
     return TOPIC if options.topic is None else str(options.topic)
 
 

@@ -40,24 +40,38 @@ class Runs:
 
     @property
     def speeds(self) -> tuple[float, ...]:
-        """Distinct speeds (V/s), ascending, of the runs with that voltage change which has the most of them."""
+        """Distinct speeds (V/s), ascending, of the runs with that voltage change which has the most of them.
+
+        Only runs of one direction are compared: rises that are slower than the falls tell nothing of the speed.
+        """
         timed = (self.duration > 0.0) & (self.swing != 0.0)
         swing, speed = np.abs(self.swing[timed]), np.abs(self.swing[timed]) / self.duration[timed]
+        rises = self.swing[timed] > 0.0
         best: tuple[float, ...] = ()
         for size in np.unique(np.round(np.log(swing) / np.log(_SWING_FACTOR))).tolist():
             alike = np.abs(np.log(swing) / np.log(_SWING_FACTOR) - size) < 0.5
-            found = _distinct(np.sort(speed[alike]))
+            either = _distinct(np.sort(speed[alike]))
+            ways = (_present(either, speed[alike & (rises == way)]) for way in (True, False))
+            found = max(ways, key=len)
             # Of sizes with equally many speeds, take the largest.
             if len(found) >= max(len(best), 1):
                 best = found
         return best
 
-    @property
-    def speed_range(self) -> tuple[float, float]:
-        """Speeds (V/s) of the slowest and the fastest run; zeros if no run has a duration."""
-        timed = (self.duration > 0.0) & (self.swing != 0.0)
+    def speed_range(self, way: int) -> tuple[float, float]:
+        """Return speeds (V/s) of the slowest and the fastest run that rises (1) or falls (-1); zeros if there is none.
+
+        Runs without a duration do not count.
+        """
+        timed = (self.duration > 0.0) & (way * self.swing > 0.0)
         speed = np.abs(self.swing[timed]) / self.duration[timed]
         return (float(speed.min()), float(speed.max())) if speed.size else (0.0, 0.0)
+
+
+def _present(among: tuple[float, ...], speeds: FloatArray) -> tuple[float, ...]:
+    """Return those of some speeds that occur in others, (n,), within `SPEED_FACTOR`."""
+    near = np.sqrt(SPEED_FACTOR)
+    return tuple(one for one in among if np.any((speeds > one / near) & (speeds < one * near)))
 
 
 def _distinct(speeds: FloatArray) -> tuple[float, ...]:

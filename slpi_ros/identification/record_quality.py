@@ -77,11 +77,18 @@ class DriveQuality:
     covered: float  # share of all pairs of last reversal voltage and present voltage that were visited
     samples_per_run: float  # median, between reversals
     usual_step: float  # median change from sample to sample, share of the range
-    speeds: tuple[float, ...]  # V/s, of runs with about equal voltage change, as in `Runs`
-    speed_range: tuple[float, float]  # V/s, of the slowest and the fastest run
+    speeds: tuple[float, ...]  # V/s, of runs in one direction with about equal voltage change, as in `Runs`
+    rising: tuple[float, float]  # V/s, of the slowest and the fastest rising run; zeros: none
+    falling: tuple[float, float]
     holds: tuple[float, ...]  # s
     begins_at_end: bool  # at an end of its voltage range: the initial state is known
     after_reset: float | None  # s, by when both ends were visited, which resets the hysteresis state
+
+    @property
+    def speed_range(self) -> tuple[float, float]:
+        """Speeds (V/s) of the slowest and the fastest run."""
+        ways = [way for way in (self.rising, self.falling) if way[1] > 0.0] or [(0.0, 0.0)]
+        return min(slowest for slowest, _ in ways), max(fastest for _, fastest in ways)
 
 
 @dataclass(frozen=True)
@@ -283,7 +290,8 @@ def _drive(
         samples_per_run=float(np.median(np.diff(at[runs.ends]))),
         usual_step=float(np.median(np.abs(np.diff(v)))) / float(np.ptp(v)),
         speeds=runs.speeds,
-        speed_range=runs.speed_range,
+        rising=runs.speed_range(1),
+        falling=runs.speed_range(-1),
         holds=tuple(drive.holds(t, v, drive.hold_band(v, voltage.noise, voltage.digit)).tolist()),
         begins_at_end=bool(min(v[0] - v.min(), v.max() - v[0]) <= near),
         after_reset=after_reset,
@@ -345,6 +353,15 @@ def findings(quality: Quality) -> list[Finding]:
     ]
 
 
+def missing_samples(record: Record) -> tuple[Finding, ...]:
+    """Return what the stamps of a record tell of samples that it lacks, whichever axis moved; empty: none."""
+    clocks = []
+    for v in record.voltage.values():
+        known = v[np.isfinite(v)]
+        clocks.append(_clock(record.t, v, NEAR_END * float(np.ptp(known)) if known.size else 0.0))
+    return tuple(_missing_findings(max(clocks, key=lambda clock: clock.unseen)))
+
+
 def require_usable(found: Iterable[Finding], where: str) -> None:
     """Raise IdentificationError for the first finding of level "stop"; its message begins with `where`."""
     for finding in found:
@@ -365,6 +382,12 @@ def _clock_findings(clock: ClockQuality) -> Iterator[Finding]:
     text = f"{clock.samples} samples in {clock.duration:.6g} s, {1.0 / period:.5g} per second"
     jitter = clock.jitter / period
     yield _warn_if(jitter > _JITTER, f"{text}, jitter {jitter:.1%} of the period", "lags will be uncertain")
+    yield from _missing_findings(clock)
+    if clock.duplicates:
+        yield Finding("warn", f"{_of(clock.duplicates, clock.samples)} with the stamp of the one before")
+
+
+def _missing_findings(clock: ClockQuality) -> Iterator[Finding]:
     if clock.lost:
         text = f"{clock.lost} samples missing between {clock.samples} others, {clock.longest_gap:.4g} s at most"
         yield Finding("warn", text)
@@ -372,8 +395,6 @@ def _clock_findings(clock: ClockQuality) -> Iterator[Finding]:
         yield Finding(
             "warn", f"{clock.unseen} gaps within which the voltage moved: unseen reversals leave the memory uncertain"
         )
-    if clock.duplicates:
-        yield Finding("warn", f"{_of(clock.duplicates, clock.samples)} with the stamp of the one before")
 
 
 def _held(quality: Quality) -> Iterator[Finding]:
@@ -488,15 +509,28 @@ def _speeds_and_holds(drive: DriveQuality) -> str:
         case (speed,) if fastest <= SPEED_FACTOR * slowest:
             text = f"one speed, {speed:.3g} V/s"
         case (_,):
-            text = f"moves from {slowest:.3g} to {fastest:.3g} V/s, those of one size at one speed"
+            text = f"moves from {slowest:.3g} to {fastest:.3g} V/s, those of one size and direction at one speed"
         case (slow, *_, fast):
             text, lacking = f"{len(drive.speeds)} speeds from {slow:.3g} to {fast:.3g} V/s", []
+    if _differ(drive.rising[0], drive.falling[0]) or _differ(drive.rising[1], drive.falling[1]):
+        text += f" (rising {_speeds(drive.rising)}, falling {_speeds(drive.falling)})"
     if drive.holds:
         text += f", {len(drive.holds)} hold{'s' * (len(drive.holds) > 1)} of up to {max(drive.holds):.3g} s"
     else:
         text += ", no hold"
         lacking.append("creep")
     return text + (f": cannot tell {', '.join(lacking)} from hysteresis" if lacking else "")
+
+
+def _speeds(of: tuple[float, float]) -> str:
+    """Return the slowest and the fastest speed (V/s) in words."""
+    slowest, fastest = (f"{speed:.3g}" for speed in of)
+    return f"at {fastest} V/s" if slowest == fastest else f"at {slowest} to {fastest} V/s"
+
+
+def _differ(one: float, other: float) -> bool:
+    """Return whether two speeds (V/s) differ; one of no run, 0, is no other speed."""
+    return 0.0 < SPEED_FACTOR * min(one, other) < max(one, other)
 
 
 def _of(count: int, samples: int) -> str:

@@ -263,6 +263,10 @@ class Calibrator(Node):
         said = worker.outcome()
         if isinstance(said, Progress):
             self._progress = said
+            if said.missing:
+                told = "; ".join(finding.text for finding in said.missing)
+                self.get_logger().warning(f"step {said.step}: {said.doing}: {told}")
+                return
             error = "" if said.error is None else f", mean error {said.error * 1e6:.4f} µm"
             self.get_logger().info(f"step {said.step}: {said.doing}; {said.seconds_left:.0f} s of drives left{error}")
         elif isinstance(said, Wanted):

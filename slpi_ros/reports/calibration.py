@@ -72,7 +72,13 @@ def page_of(outcome: Outcome) -> Page:
         show_steps(page, axis, loop.steps)
     page.heading("What was recorded, why, and what it showed")
     rows = [
-        (step.name, f"{step.seconds:.0f} s" if step.seconds else "", step.why, step.finding) for step in outcome.steps
+        (
+            step.name,
+            f"{step.seconds:.0f} s" if step.seconds else "",
+            step.why,
+            "; ".join([step.finding, *(one.text for one in step.missing)]),
+        )
+        for step in outcome.steps
     ]
     page.table(("step", "drive", "why", "what it showed"), rows)
     page.heading("The model")

@@ -20,6 +20,8 @@ LONGEST_DELAY, DELAY_SHARE, DELAY_STEPS = 0.5, 0.05, 200
 
 # A delay varies if one for each of so many parts of the path reduces the difference by this factor.
 VARIES, DELAY_WINDOWS = 1.8, 100
+# Percentiles that are told as its range.
+VARIED = (0.05, 0.95)
 
 # What each part of a tracking error is, and what helps.
 CAUSES = {
@@ -241,7 +243,7 @@ def track(
         t=t,
         desired=d,
         parts=parts,
-        delays=None if delays is None else tuple(np.quantile(delays, (0.05, 0.95)).tolist()),
+        delays=None if delays is None else tuple(np.quantile(delays, VARIED).tolist()),
         noise_rms=noise_rms,
     )
 
@@ -249,25 +251,31 @@ def track(
 def _delay(t: FloatArray, desired: FloatArray, model: FloatArray) -> tuple[float, FloatArray | None]:
     """Return the delay (s) of the model behind the desired displacement, and that of each sample, (N,), if it varies.
 
-    0 if no delay is clearly better.
+    0 if no delay is clearly better. What counts is the rms of each window, and not its square: a large step that the
+    slew limit held back would else decide on the delay of the whole path.
     """
     longest = min(LONGEST_DELAY, DELAY_SHARE * float(t[-1] - t[0]))
     shifts = np.linspace(0.0, longest, DELAY_STEPS + 1)
     window = np.minimum(((t - t[0]) / (t[-1] - t[0]) * DELAY_WINDOWS).astype(int), DELAY_WINDOWS - 1)
-    misses, squares = [], []
-    for shift in shifts.tolist():
-        left = model - np.interp(t - shift, t, desired)
-        misses.append(float(np.std(left)))
-        squares.append(np.bincount(window, (left - np.median(left)) ** 2, DELAY_WINDOWS))
+    counts = np.maximum(np.bincount(window, minlength=DELAY_WINDOWS), 1)
+
+    def left(shift: float | FloatArray) -> FloatArray:
+        """Return the mean square (m^2) of what each window leaves at a delay (s)."""
+        rest = model - np.interp(t - shift, t, desired)
+        return np.bincount(window, (rest - np.median(rest)) ** 2, DELAY_WINDOWS) / counts
+
+    by_window = np.array([left(shift) for shift in shifts.tolist()])
+    misses = np.sqrt(by_window).mean(axis=1)
     best = int(np.argmin(misses))
     best = best if misses[best] < misses[0] / BETTER else 0
-    by_window = np.array(squares)
     own = np.argmin(by_window, axis=0)
     # At rest every delay serves.
     own = np.where(by_window.min(axis=0) < by_window[best] / BETTER, own, best)
     centres = t[0] + (np.arange(DELAY_WINDOWS) + 0.5) / DELAY_WINDOWS * (t[-1] - t[0])
     delays = np.interp(t, centres, shifts[own])
-    if float(np.std(model - np.interp(t - delays, t, desired))) * VARIES < misses[best]:
+    # One that differs in a few windows alone is no delay of the path: what is left there is a matter of the voltages.
+    low, high = np.quantile(delays, VARIED)
+    if low < high and float(np.sqrt(left(delays)).mean()) * VARIES < misses[best]:
         return float(np.median(delays)), delays
     return float(shifts[best]), None
 

@@ -33,6 +33,13 @@ class Ended(SlpiError):
     """Raised by a recorder that is interrupted."""
 
 
+def without(record, lost):
+    """Return a record without the samples of a slice."""
+    kept = np.delete(np.arange(len(record)), lost)
+    signals = ({axis: x[kept] for axis, x in each.items()} for each in (record.voltage, record.displacement))
+    return Record(record.time_ns[kept], *signals, record.source, record.hardware_id)
+
+
 class Spoiled(SimulatedRecorder):
     """A recorder whose record of the check is spoiled."""
 
@@ -240,16 +247,23 @@ def test_a_hidden_cause_is_named_and_undone(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_sensor_that_is_slower_than_the_record_is_told():
+def test_a_sensor_that_is_slower_than_the_record_and_lost_messages_are_told(tmp_path):
     class Held(SimulatedRecorder):
         def __call__(self, request):
             recording = super().__call__(request)
             (y,) = recording.record.displacement.values()
-            held = y[np.arange(y.size) // 2 * 2]
-            return replace(recording, record=replace(recording.record, displacement={"x": held}))
+            record = replace(recording.record, displacement={"x": y[np.arange(y.size) // 2 * 2]})
+            if request.name == "02_calibration":
+                record = without(record, slice(2000, 2100))
+            return replace(recording, record=record)
 
-    recorder = Held(stage_of(Character()))
-    outcome = calibrate(settings(), recorder)
+    recorder, progress = Held(stage_of(Character())), []
+    outcome = calibrate(settings(), recorder, progress.append)
     assert outcome.met
+    (lost,) = (step for step in outcome.steps if step.missing)
+    assert lost.name == "02_calibration" and holds(lost.missing[0].text, 100)
+    assert [said.missing for said in progress if said.missing] == [lost.missing]
+    write_files(tmp_path, outcome)
+    assert lost.missing[0].text in (tmp_path / "report.html").read_text()
     told = [step.finding for step in outcome.steps if step.name.endswith("_calibration")]
     assert told and all(holds(finding, 2, round(RATE / 2)) for finding in told)

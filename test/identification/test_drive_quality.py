@@ -24,6 +24,22 @@ def test_speeds_and_holds():
     assert holds(T, noisy, 0.45) == pytest.approx([1.0, 2.0, 2.0], abs=0.05)
 
 
+def test_a_sawtooth_does_not_show_two_speeds():
+    def drive(*rates):
+        v = np.tile([0.0, 80.0], len(rates) // 2 + 1)[: len(rates) + 1]
+        t = np.concatenate([[0.0], np.cumsum(80.0 / np.array(rates))])
+        at = np.arange(0.0, t[-1], 0.002)
+        return Runs.of(at, np.interp(at, t, v), 0.5)
+
+    sawtooth = drive(*[20.0, 200.0] * 6)
+    assert len(sawtooth.speeds) == 1
+    assert sawtooth.speed_range(1) == pytest.approx((20.0, 20.0), rel=0.05)
+    assert sawtooth.speed_range(-1) == pytest.approx((200.0, 200.0), rel=0.05)
+    # As rises of two speeds, and one period of each of two speeds, do.
+    assert drive(*[20.0, 200.0, 60.0, 200.0] * 3).speeds == pytest.approx((20.0, 60.0), rel=0.05)
+    assert drive(20.0, 20.0, 60.0, 60.0).speeds == pytest.approx((20.0, 60.0), rel=0.05)
+
+
 def test_covered_pairs():
     sine = 50 - 50 * np.cos(2 * np.pi * T)
     # Turns at the lowest and the highest of ten cells, and from each all others.

@@ -10,7 +10,8 @@ from identification.records import calibration, record_of, stage
 
 from slpi_ros.errors import IdentificationError, RecordError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
-from slpi_ros.identification.record_quality import Finding, assess, findings, require_usable
+from slpi_ros.identification.record_quality import Finding, assess, findings, missing_samples, require_usable
+from slpi_ros.io.record import Record
 from slpi_ros.io.tables import import_table
 from slpi_ros.simulation.axis import SimulatedAxis
 from slpi_ros.simulation.character import Character
@@ -346,6 +347,17 @@ def test_findings_on_measured_records(measured_data):
         assert picma.displacement.noise == pytest.approx(0.072e-6, rel=0.1)
         assert picma.displacement.digit == pytest.approx(1.933e-9, rel=1e-3)
         assert picma.displacement.spikes == picma.displacement.stale == 0
+
+
+def test_samples_are_missing_for_all_axes_and_turns_for_the_one_that_moved():
+    t, v, _ = measured(0)
+    kept = (t < 10) | (t > 10.6)
+    v = {"x": np.full(t.size, np.nan), "y": np.zeros(t.size), "z": v}
+    time_ns = np.round(t * 1e9).astype(np.int64)
+    parts = [Record(time_ns[at], *({axis: x[at] for axis, x in v.items()},) * 2, "") for at in (kept, t < 10)]
+    assert [len(missing_samples(part)) for part in parts] == [2, 0]
+    rests = replace(parts[0], voltage={axis: np.zeros(kept.sum()) for axis in v})
+    assert [finding.level for finding in missing_samples(rests)] == ["warn"]
 
 
 def test_late_stamps_are_no_missing_samples():

@@ -23,6 +23,10 @@ FREE = """[...document.querySelectorAll('figure.chart')].every(figure =>
     <= figure.querySelector('.nsewdrag').getBoundingClientRect().top
   && figure.querySelector('.main-svg').getBoundingClientRect().bottom
     <= figure.querySelector('figcaption').getBoundingClientRect().top + 1)"""
+# Charts of which the legend lies under the buttons.
+UNDER = """[...document.querySelectorAll('figure.chart')].filter(figure => {
+  const [a, b] = ['.legend .bg', '.modebar'].map(part => figure.querySelector(part)?.getBoundingClientRect());
+  return a && b && a.right > b.left && a.bottom > b.top && a.top < b.bottom; }).length"""
 PAPER = "document.querySelector('#x-time .main-svg').style.background"
 NOISE_FLOOR = "[...document.querySelectorAll('#x-frequency .js-line')].at(-1).style.stroke"
 BESIDE = """(([a, b]) => a.getBoundingClientRect().top === b.getBoundingClientRect().top)(
@@ -136,6 +140,14 @@ def test_no_legend_covers_a_chart_and_nothing_is_wider_than_the_window(browser, 
     assert browser.run("document.documentElement.scrollWidth") <= width
     assert browser.run(BESIDE) == (width > 640)
     assert not browser.complaints()
+
+
+@pytest.mark.parametrize("width", [700, 900, 1280])
+def test_no_button_covers_a_legend(browser, pages, width):
+    look(browser, width, "light", pages["verify"])
+    assert browser.run("document.querySelectorAll('.modebar').length") > 0
+    browser.until(FREE)
+    assert browser.run(UNDER) == 0
 
 
 def test_dark_paper_has_light_ink_and_is_printed_light(browser):

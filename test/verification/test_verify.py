@@ -344,6 +344,21 @@ def test_a_delay_that_varies_is_told_apart(model):
     assert "varies" in "".join(describe_verification(found)) and "busy" in tracking.advice("delay")
 
 
+@pytest.mark.parametrize("late", [0, 4])
+def test_a_step_that_the_slew_limit_held_back_is_no_delay_of_the_path(late, model):
+    t, _ = path(model)
+    low, high = model.axes["x"].displacement_range
+    desired = low + (high - low) * (0.3 + 0.1 * np.sin(4.4 * t) + 0.3 * (t > 7.0))
+    v = model.compensate(t, desired, start_memory="start")
+    for k, most in zip(range(1, v.size), np.diff(t) * 150.0, strict=True):
+        v[k] = np.clip(v[k], v[k - 1] - most, v[k - 1] + most)
+    v = np.concatenate([np.full(late, v[0]), v[: v.size - late]])
+    y = after((), 0.0).run(t + 100.0, v)[1]
+    tracking = judged(record_of(t, v, y), model, desired=[{"x": desired}]).tracking
+    assert tracking.delay == pytest.approx(late / RATE, abs=0.5 / RATE) and tracking.delays is None
+    assert tracking.shares["command"] > 0.4
+
+
 @pytest.mark.parametrize(("gain", "volts"), [(0.98, 0.0), (1.0, 2.0)])
 def test_voltages_of_another_model_are_no_delay(gain, volts, model):
     t, desired = path(model)

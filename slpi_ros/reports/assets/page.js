@@ -50,13 +50,17 @@
     layout.height *= rows.length > 1 ? 0.8 * rows.length : 1;
   }
 
-  // Makes room for all lines of the legend.
+  // Makes room for all lines of the legend, below the buttons where it is as wide as to reach them.
   function fit(div, layout) {
-    const legend = div.querySelector(".legend .bg");
-    const more = legend ? Math.max(0, legend.getBBox().height + 14 - layout.margin.t) : 0;
-    div.style.minHeight = `${layout.height + more}px`;
+    const legend = div.querySelector(".legend .bg"), bar = printing ? null : div.querySelector(".modebar");
+    const place = bar && bar.getBoundingClientRect();
+    const low = legend && bar && legend.getBoundingClientRect().right > place.left
+      ? place.bottom - div.getBoundingClientRect().top : 0;
+    const more = legend ? Math.max(0, legend.getBBox().height + low + 14 - layout.margin.t) : 0;
+    const height = layout.height + more;
+    div.style.minHeight = `${height}px`;
     if (more !== div._fullLayout.margin.t - layout.margin.t)
-      return Plotly.relayout(div, { height: layout.height + more, "margin.t": layout.margin.t + more });
+      return Plotly.relayout(div, { height, "margin.t": layout.margin.t + more, "legend.y": 1 - low / height });
   }
 
   function again() {

@@ -261,7 +261,8 @@ class Judge:
                 dropped = tuple(sorted(one.name for one in answer.named))
                 return Answer(self._base, self._base, structures=(name,), dropped=dropped)
             with_it = now.beside(columns(now)).held_out
-            if self._beats(with_it, now.held_out):
+            explains = share(with_it, now.held_out, self._noise) >= EXPLAINED
+            if explains and self._beats(with_it, now.held_out):
                 found.append((with_it.square, name))
         return replace(answer, structures=(min(found)[1],)) if found else answer
 

@@ -1,7 +1,7 @@
 """Search for the set of effects that predicts best what was not fitted."""
 
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -162,7 +162,7 @@ class Library:
             for form in _forms(name, self.now):
                 if isinstance(form, Candidate):
                     if form.columns.shape[1] and np.isfinite(form.columns).all():
-                        yield name, form, form.columns
+                        yield name, _bare(form), form.columns
                     continue
                 try:
                     yield name, form, (self.now.predicted_with(form) - self.now.predicted)[:, None]
@@ -262,6 +262,11 @@ class Library:
         return fit
 
 
+def _bare(candidate: Candidate) -> Candidate:
+    """Return a candidate without the samples of its columns, which would fill the memory."""
+    return replace(candidate, columns=np.empty((0, candidate.columns.shape[1])))
+
+
 def _forms(name: str, now: JointFit) -> Iterator[Candidate | Effect]:
     """Yield the forms of an effect: with common parameters, with separate ones in each record, or both."""
     records, own = len(now.evidence.parts), is_own(EFFECTS[name])
@@ -270,7 +275,8 @@ def _forms(name: str, now: JointFit) -> Iterator[Candidate | Effect]:
     if records == 1 or not (own or EFFECTS[name].sharing == "either"):
         return
     for forms in zip(*(EFFECTS[name].fit(now.of_record(k)) for k in range(records)), strict=False):
-        yield Candidate(now.evidence.each([form.columns for form in forms]), partial(_each, forms))  # type: ignore[arg-type]
+        parts = [form for form in forms if isinstance(form, Candidate)]
+        yield Candidate(now.evidence.each([part.columns for part in parts]), partial(_each, [*map(_bare, parts)]))  # type: ignore[arg-type]
 
 
 def _each(forms: Sequence[Candidate], gains: FloatArray) -> EachRecord | None:

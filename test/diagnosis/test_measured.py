@@ -72,3 +72,22 @@ def test_loops_that_depend_on_bias_are_told_from_drift(measured_data):
     assert "thermal_drift" not in [named.name for named in axis.effects]
     assert "'slpi'" in axis.next_experiment
     assert axis.after_rms < 0.3 * axis.before_rms
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("given", [1, 2])
+def test_of_a_mirror_without_hysteresis_a_mode_is_named(measured_data, given):
+    """Whether the given model has fitted one of the two sines or both."""
+    sines = [import_table(measured_data / f"mirror_sine_{name}.csv") for name in ("1p02hz", "0p49hz")]
+    model = slpi_ros.identify(sines[:given])
+    diagnosis = slpi_ros.diagnose(sines, model)
+    (found,) = diagnosis.axes.values()
+    assert [(one.name, one.alternatives) for one in found.effects] == [("resonance", ())]
+    mode = max(found.effects[0].effect.modes, key=lambda one: one.share)
+    # Its own steps: 6.2 and 7.0 Hz.
+    assert mode.frequency == pytest.approx(6.6, rel=0.1)
+    square = import_table(measured_data / "mirror_square_250mv.csv")
+    extended, plain = (slpi_ros.verify(square, each) for each in (diagnosis.extended, model))
+    for axis, one in extended.axes.items():
+        # Of range, what a linear mode that is fitted to the sines has there.
+        assert one.rest.rms <= min(0.027 * np.ptp(square.displacement[axis]), plain.axes[axis].rest.rms)

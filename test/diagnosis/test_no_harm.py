@@ -47,9 +47,7 @@ def test_what_is_found_in_steps_does_no_harm_at_other_speeds(measured_data):
     model = slpi_ros.identify(record)
     diagnosis = slpi_ros.diagnose(record, model)
     (found,) = diagnosis.axes.values()
-    assert found.verdict == "unexplained" or {"lag", "delay"} == {
-        name for one in found.effects for name in (one.name, *one.alternatives)
-    }
+    assert all({"lag", "delay"} <= {one.name, *one.alternatives} for one in found.effects)
     for name in ("hasel_1hz", "hasel_5hz"):
         other = import_table(measured_data / f"{name}.csv")
         extended, plain = (slpi_ros.verify(other, each) for each in (diagnosis.extended, model))

@@ -4,7 +4,8 @@ Every record is drawn from a seed, identified and diagnosed, and only then compa
 the cause is not there and no alternative is it; a diagnosis is silent if it claims to be complete although more than
 1.5 times the sensor noise is left, or says nothing of a cause of at least three times the noise. An ambiguous
 diagnosis with the truth among its alternatives is right where the record that it asks for decides: that is simulated on
-the same stage, and both are diagnosed together.
+the same stage, and both are diagnosed together. Models are judged on one more record, without its constant.
+``--beside CLONE``, a built clone of another commit: the same records are diagnosed by it, too.
 """
 
 # To be set before NumPy is imported: the processes share the cores.
@@ -13,23 +14,29 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
+import json
+import tempfile
 import time
 from collections import Counter, defaultdict
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from itertools import combinations
+from functools import cached_property, partial
+from itertools import combinations, count
 from multiprocessing import get_context
+from pathlib import Path
 
 import kept
 import numpy as np
 from hidden import CONFUSABLE, NAMES, again, hide
 from hidden.unknown import KINDS, NEAR, hide_unknown
+from identification_speed import run as run_clone
 from next_record import advised_drive
 from numpy.typing import NDArray
 from scipy.stats import beta
 
 import slpi_ros
 from slpi_ros.excitation.drives import calibration_drive
+from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.record import Record
 from slpi_ros.simulation.axis import SimulatedAxis
 from slpi_ros.simulation.character import Character
@@ -50,6 +57,22 @@ MEANT = {
 # Group "simulator": the simulated stage of the package and its default calibration drive (s, Hz), sensor noise (m), lag
 # (s), and smallest and largest creep per decade of time (share of the displacement).
 DURATION, RATE, NOISE, LAG, CREEP = 60.0, 500.0, 8e-9, 3e-3, (0.005, 0.03)
+# Runs in another clone: the diagnosis of one axis of a bag, and the errors (m, rms) of both models on another one.
+INSIDE = """
+import json, sys, time, slpi_ros
+axis, record, third = sys.argv[1], *(slpi_ros.read_bag(bag) for bag in sys.argv[2:])
+model = slpi_ros.identify(record)
+began = time.process_time()
+diagnosis = slpi_ros.diagnose(record, model, axes=[axis])
+seconds, found = time.process_time() - began, diagnosis.axes[axis]
+print(json.dumps({
+    "verdict": found.verdict, "named": [[one.name, *one.alternatives] for one in found.effects],
+    "left": found.after_rms, "noise": found.noise_rms, "seconds": seconds,
+    "third": [slpi_ros.verify(third, each).axes[axis].rest.rms for each in (model, diagnosis.extended)],
+}))
+"""
+# Seconds of the record on which models are judged.
+THIRD = 30.0
 
 
 @dataclass(frozen=True)
@@ -76,6 +99,8 @@ class Outcome:
     # What both records together say, if the first one is ambiguous: the same as `verdict` and `named`.
     then: str = ""
     then_named: tuple[tuple[str, ...], ...] = ()
+    # Errors on another record of the model without causes and of the extended one, in times of the noise.
+    third: tuple[float, float] | None = None
 
     @property
     def decided(self) -> bool:
@@ -111,6 +136,8 @@ class Outcome:
         named = ", ".join(one[0] + (f" (or {'/'.join(one[1:])})" if one[1:] else "") for one in self.named) or "-"
         mark = "".join(text for text, is_so in ((" WRONG", self.wrong), (" SILENT", self.silent)) if is_so)
         told = f"{self.verdict} {named}; left {self.left:.2f} (noise {self.noise:.2f}) {self.goes_with}"
+        if self.third:
+            told += "; next {:.2f} -> {:.2f}".format(*self.third)
         if self.then:
             told += f"; with the next record {self.then} {', '.join('/'.join(one) for one in self.then_named) or '-'}"
         return (
@@ -119,35 +146,58 @@ class Outcome:
         )
 
 
-def run(case: Case) -> Outcome:
-    """Hide, identify, diagnose, and compare."""
-    began = time.process_time()
+def run(case: Case, beside: Path | None = None) -> list[Outcome]:
+    """Hide, identify, diagnose, and compare; the outcome of this commit, and that of the clone `beside`."""
+    stage = _drawn(case)
     try:
-        stage = _drawn(case)
-        model = slpi_ros.identify(stage.record)
-        began = time.process_time()
-        found = slpi_ros.diagnose(stage.record, model, axes=[stage.axis]).axes[stage.axis]
-        outcome = Outcome(
-            case,
-            found.verdict,
-            tuple((one.name, *one.alternatives) for one in found.effects),
-            found.after_rms / stage.floor,
-            found.noise_rms / stage.floor,
-            f"{found.left[0].variable} {found.left[0].share:.0%}" if found.left else "",
-            time.process_time() - began,
-        )
-        if found.verdict != "ambiguous" or not outcome.right or case.group == "unknown":
-            return outcome
-        second = stage.next(found.next_experiment or "")
-        if second is None:
-            return replace(outcome, then="no record advised")
-        both = slpi_ros.diagnose([stage.record, second], model, axes=[stage.axis]).axes[stage.axis]
-        return replace(
-            outcome, then=both.verdict, then_named=tuple((one.name, *one.alternatives) for one in both.effects)
-        )
+        outcomes = [_outcome(case, stage)]
     # One failing case must not end a long run; it is printed and counts as wrong.
     except Exception as error:
-        return Outcome(case, "failed", (), 0.0, 0.0, "", 0.0, f"{type(error).__name__}: {error}"[:150])
+        outcomes = [Outcome(case, "failed", (), 0.0, 0.0, "", 0.0, f"{type(error).__name__}: {error}"[:150])]
+    return outcomes + ([_outcome_beside(case, stage, beside)] if beside else [])
+
+
+def _outcome(case: Case, stage: "Drawn") -> Outcome:
+    model = slpi_ros.identify(stage.record)
+    began = time.process_time()
+    diagnosis = slpi_ros.diagnose(stage.record, model, axes=[stage.axis])
+    seconds, found, third = time.process_time() - began, diagnosis.axes[stage.axis], stage.third
+    errors = [slpi_ros.verify(third, each).axes[stage.axis].rest.rms for each in (model, diagnosis.extended) if third]
+    outcome = Outcome(
+        case,
+        found.verdict,
+        tuple((one.name, *one.alternatives) for one in found.effects),
+        found.after_rms / stage.floor,
+        found.noise_rms / stage.floor,
+        f"{found.left[0].variable} {found.left[0].share:.0%}" if found.left else "",
+        seconds,
+        third=(errors[0] / stage.floor, errors[1] / stage.floor) if errors else None,
+    )
+    if found.verdict != "ambiguous" or not outcome.right or case.group == "unknown":
+        return outcome
+    second = stage.next(found.next_experiment or "")
+    if second is None:
+        return replace(outcome, then="no record advised")
+    both = slpi_ros.diagnose([stage.record, second], model, axes=[stage.axis]).axes[stage.axis]
+    return replace(outcome, then=both.verdict, then_named=tuple((one.name, *one.alternatives) for one in both.effects))
+
+
+def _outcome_beside(case: Case, stage: "Drawn", clone: Path) -> Outcome:
+    third = stage.third
+    with tempfile.TemporaryDirectory() as folder:
+        bags = [Path(folder) / "record", Path(folder) / "third"]
+        for bag, record in zip(bags, (stage.record, third or stage.record), strict=True):
+            write_bag(bag, record)
+        try:
+            said = json.loads(run_clone(clone, "-W", "ignore", "-c", INSIDE, stage.axis, *map(str, bags))[1])
+        # It has printed why.
+        except SystemExit:
+            return Outcome(case, "failed", (), 0.0, 0.0, "", 0.0, "failed")
+    plain, extended = (error / stage.floor for error in said["third"])
+    named = tuple(tuple(names) for names in said["named"])
+    left, noise = said["left"] / stage.floor, said["noise"] / stage.floor
+    at_third = (plain, extended) if third else None
+    return Outcome(case, said["verdict"], named, left, noise, "", said["seconds"], third=at_third)
 
 
 @dataclass(frozen=True)
@@ -161,6 +211,17 @@ class Drawn:
     axis: str
     floor: float
     another: Callable[[FloatArray, Mapping[str, FloatArray]], Record] | None = None
+
+    @cached_property
+    def third(self) -> Record | None:
+        """A record of the stage on which models are judged, of a drive over the same range."""
+        if self.another is None:
+            return None
+        v = self.record.voltage[self.axis]
+        rate = 1.0 / float(np.median(np.diff(self.record.t)))
+        t, own = calibration_drive(float(v.min()), float(v.max()), duration=THIRD, rate=rate, seed=3)
+        rest = {axis: np.full(t.size, float(each.min())) for axis, each in self.record.voltage.items()}
+        return self.another(t, {**rest, self.axis: own})
 
     def next(self, next_experiment: str) -> Record | None:
         """Return the record that a diagnosis recommends; None if it recommends none."""
@@ -181,7 +242,8 @@ def _drawn(case: Case) -> Drawn:
     if case.group == "simulator":
         stage = _simulated(case.seed)
         t, v = calibration_drive(0.0, 100.0, duration=DURATION, rate=RATE, seed=case.seed)
-        return Drawn(_run(stage, t, v, 1), "x", NOISE, lambda t, v: _run(stage, t, v["x"], 2))
+        numbers = count(1)
+        return Drawn(_run(stage, t, v, next(numbers)), "x", NOISE, lambda t, v: _run(stage, t, v["x"], next(numbers)))
     hidden = hide(case.seed, case.hidden, samples=SAMPLES, base="preisach" if case.group == "clean" else None)
     axis = next((truth.axis for truth in hidden.truth), "x")
 
@@ -227,7 +289,7 @@ def cases(groups: list[str], draws: int, seed: int, only: str | None) -> list[Ca
 
 
 def table(outcomes: list[Outcome]) -> None:
-    """Print what was named for each hidden cause, and the rates."""
+    """Print what was named for each hidden cause, the rates, and what models gain on another record."""
     rows: dict[tuple[str, str], list[Outcome]] = defaultdict(list)
     for one in outcomes:
         rows[one.case.group, "pairs" if one.case.group == "pair" else "+".join(one.case.hidden)].append(one)
@@ -252,6 +314,15 @@ def table(outcomes: list[Outcome]) -> None:
                 f"({bad / len(own):.1%}; one-sided 95 % bound {bound:.1%}), {len(open_ones)} ambiguous"
                 f"{f', {decided} decided by the record asked for' if group != 'unknown' else ''}"
             )
+        judged = [one.third for one in own if one.third and one.named]
+        if judged:
+            ratios = [extended / plain for plain, extended in judged]
+            worse = sum(ratio > 1.05 for ratio in ratios)
+            print(
+                f"  on another record: {np.median([extended for _, extended in judged]):.2f} times the noise in the "
+                f"median, {np.median(ratios):.2f} of the error without causes, most {max(ratios):.2f}; more than 1.05 "
+                f"in {worse} of {len(ratios)}"
+            )
     times = [one.seconds for one in outcomes]
     print(f"CPU time of a diagnosis: median {np.median(times):.1f} s, longest {max(times):.1f} s")
 
@@ -264,13 +335,16 @@ def main() -> None:
     parser.add_argument("--groups", nargs="+", choices=GROUPS, default=list(GROUPS))
     parser.add_argument("--only", help="cases with this effect or kind")
     parser.add_argument("--processes", type=int, default=2)
+    parser.add_argument("--beside", type=Path, metavar="CLONE", help="built clone of another commit")
     parser.add_argument("--keep", action="store_true", help=f"write the figures to {kept.KEPT.name}")
     options = parser.parse_args()
-    outcomes = []
+    outcomes, others = list[Outcome](), list[Outcome]()
+    chosen = cases(options.groups, options.draws, options.seed, options.only)
     with get_context("spawn").Pool(options.processes, maxtasksperchild=20) as pool:
-        for outcome in pool.imap_unordered(run, cases(options.groups, options.draws, options.seed, options.only)):
-            print(outcome.line(), flush=True)
+        for outcome, *other in pool.imap_unordered(partial(run, beside=options.beside), chosen):
+            print(outcome.line(), *(f"    beside: {one.line()}" for one in other), sep="\n", flush=True)
             outcomes.append(outcome)
+            others += other
     if options.keep:
         for group in options.groups:
             own = [one for one in outcomes if one.case.group == group]
@@ -278,7 +352,10 @@ def main() -> None:
             said = f"{sum(one.right for one in own)} of {len(own)}; {bad} wrong or nothing reported"
             said = f"{bad} of {len(own)}" if group in ("clean", "unknown") else said
             kept.write_row(f"confusion {group}", f"diagnosis, {MEANT[group]}", said, "make bench-confusion")
-    table(sorted(outcomes, key=lambda one: (GROUPS.index(one.case.group), one.case.hidden, one.case.seed)))
+    for found, whose in ((outcomes, "this commit"), (others, "the other one")):
+        if found:
+            print(f"\n{whose}")
+            table(sorted(found, key=lambda one: (GROUPS.index(one.case.group), one.case.hidden, one.case.seed)))
 
 
 if __name__ == "__main__":

@@ -208,7 +208,7 @@ def characters(count: int, first: int, keep: bool) -> None:
     if rows and keep:
         what = (
             f"calibrator, {len(stages)} simulated stages with one or two hidden effects: stages with all causes found; "
-            "median error on a new path; the same without causes, after a fixed drive"
+            "median error on a new path; the same without causes, from a drive that is the same for all stages"
         )
         error = np.median([row.error.rest / row.error.stroke for row in rows])
         fixed = np.median([row.fixed.rest / row.fixed.stroke for row in rows])

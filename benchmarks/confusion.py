@@ -217,11 +217,11 @@ class Drawn:
         """A record of the stage on which models are judged, of a drive over the same range."""
         if self.another is None:
             return None
-        v = self.record.voltage[self.axis]
-        rate = 1.0 / float(np.median(np.diff(self.record.t)))
-        t, own = calibration_drive(float(v.min()), float(v.max()), duration=THIRD, rate=rate, seed=3)
-        rest = {axis: np.full(t.size, float(each.min())) for axis, each in self.record.voltage.items()}
-        return self.another(t, {**rest, self.axis: own})
+        rate, drives = 1.0 / float(np.median(np.diff(self.record.t))), dict[str, FloatArray]()
+        for number, (axis, v) in enumerate(self.record.voltage.items()):
+            ends = float(v.min()), float(v.max())
+            t, drives[axis] = calibration_drive(*ends, duration=THIRD, rate=rate, seed=number + 3)
+        return self.another(t, drives)
 
     def next(self, next_experiment: str) -> Record | None:
         """Return the record that a diagnosis recommends; None if it recommends none."""

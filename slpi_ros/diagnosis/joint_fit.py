@@ -180,6 +180,12 @@ class Equations:
             found[samples] = predicted[np.maximum(place, 0)]
         return found
 
+    @property
+    def first_rise(self) -> Mask:
+        """Mask of the samples, shape (N,), before the first motion or on the first rise, which happen once."""
+        walk = self.problem.design.walk
+        return np.asarray((walk.first_rise | (walk.direction == 0))[self.evidence.rows])
+
     def padded(self, signal: FloatArray) -> FloatArray:
         """Return a signal, shape (N,), metres, at the rows of the problem, in units of its scale; 0 at others."""
         whole = np.zeros(self.problem.y.size)

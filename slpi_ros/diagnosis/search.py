@@ -48,6 +48,7 @@ def seen(now: JointFit) -> FitContext:
         excited_frequency=lambda: excited_frequency(evidence),
         drives=drives,
         zeros=lambda: now.zeros,
+        first_rise=lambda: now.equations.first_rise,
         left_without=lambda name: now.y - now.prediction_without(name),
         records=now.around.records,
     )

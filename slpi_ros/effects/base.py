@@ -553,10 +553,12 @@ class FitContext:
     effects: Sequence[Effect]
     # Return the highest frequency (Hz) that any record excites; of each record the single drive frequency (Hz), 0 if
     # there are several, and the duration (s); the displacement (m) at the centre of the largest loop of each record;
-    # and what would be left (m) without the effect of a name, everything else unchanged.
+    # the mask of the samples, (N,), on the way to the largest displacement so far, which happens once; and what would
+    # be left (m) without the effect of a name, everything else unchanged.
     excited_frequency: Callable[[], float]
     drives: Callable[[], Sequence[tuple[float, float]]]
     zeros: Callable[[], FloatArray]
+    first_rise: Callable[[], Mask]
     left_without: Callable[[str], FloatArray]
     # Contexts of the records that the signals are concatenated from; empty for a single record.
     records: tuple[EffectContext, ...] = ()
@@ -568,13 +570,17 @@ class FitContext:
         first = sum(record.t.size for record in self.records[:k])
         own = slice(first, first + self.records[k].t.size)
         t, v, u, h, y = (x[own] for x in (self.t, self.v, self.u, self.h, self.y))
-        drives, zeros = (lambda: [self.drives()[k]]), (lambda: self.zeros()[k : k + 1])
+        drives, zeros, rise = (
+            (lambda: [self.drives()[k]]), (lambda: self.zeros()[k : k + 1]), (lambda: self.first_rise()[own])
+        )  # fmt: skip
         effects, excited = self.effects, self.excited_frequency
 
         def left_without(name: str) -> FloatArray:
             return self.left_without(name)[own]
 
-        return FitContext(t, v, u, h, y, self.used[own], self.rounding, effects, excited, drives, zeros, left_without)
+        return FitContext(
+            *(t, v, u, h, y, self.used[own], self.rounding, effects), excited, drives, zeros, rise, left_without
+        )
 
     @property
     def step(self) -> float:

@@ -61,8 +61,8 @@ class Contact(EffectBase):
     uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def plausible(self, context: FitContext) -> bool:
-        """Return whether the stage is on either side of the position for a part of the samples."""
-        beyond = float(np.mean(context.y[context.used] > self.position))
+        """Return whether the stage is again and again on either side of the position."""
+        beyond = float(np.mean(context.y[context.used & ~context.first_rise()] > self.position))
         return LEAST_SHARE <= beyond <= 1.0 - LEAST_SHARE
 
     def shifted(self, by: float) -> Self:

@@ -13,6 +13,7 @@ import scipy.linalg
 
 from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.arrays.rates import slopes
+from slpi_ros.diagnosis.prepare import frequency_of_moves
 from slpi_ros.effects.base import usual_step, wave
 from slpi_ros.effects.jumps import jumps
 from slpi_ros.errors import length
@@ -286,6 +287,9 @@ def _lines(record: Signals) -> list[float]:
         for x in (record.residual, record.v)
     )
     frequency = np.fft.rfftfreq(4 * grid.size, step)
+    base, period = frequency_of_moves(t, record.v), float(t[-1] - t[0])
+    if base:
+        base = _refined(t, record.v - np.mean(record.v), base, 1.0 / period)
     # Bins of four times the length: a line with this window is 16 bins wide.
     wide = 16
     rest = power.copy()
@@ -298,8 +302,10 @@ def _lines(record: Signals) -> list[float]:
         near = slice(max(k - wide, 0), k + wide)
         # A harmonic of the drive is no line of its own: what goes with it repeats with the motion.
         driven = drive[k] > 1e-6 * drive[wide:].max() and drive[k] >= 0.5 * drive[near].max()
+        # Of one frequency of the drive also those that a bent characteristic makes of it.
+        off = frequency[k] - base * np.round(frequency[k] / base) if base else np.inf
         # Of a few periods nobody can say that they are one line: that is a drift.
-        if not driven and frequency[k] * (t[-1] - t[0]) >= PERIODS:
+        if not driven and abs(off) * period >= 2.0 and frequency[k] * period >= PERIODS:
             found.append(_refined(t, record.residual, float(frequency[k]), 1.0 / (4 * grid.size * step)))
         rest[near] = 0.0
     return found

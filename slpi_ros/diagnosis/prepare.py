@@ -445,15 +445,17 @@ def one_speed(evidence: Evidence) -> bool:
 
 def drive_frequency(evidence: Evidence) -> float:
     """Return the single drive frequency (Hz) of all records; 0 if there are several."""
-    found = []
-    for part in evidence.parts:
-        # The first move and the last one may be cut off.
-        duration = Runs.of(part.t, part.v, _dead_band(part.v)).duration[1:-1]
-        usual = float(np.median(duration)) if duration.size else 0.0
-        if not (usual > 0.0 and np.mean((duration < ALMOST * usual) & (usual < ALMOST * duration)) > MOST_RUNS):
-            return 0.0
-        found.append(0.5 / usual)
+    found = [frequency_of_moves(part.t, part.v) for part in evidence.parts]
     return float(np.median(found)) if max(found) < ALMOST * min(found) else 0.0
+
+
+def frequency_of_moves(t: FloatArray, v: FloatArray) -> float:
+    """Return the single frequency (Hz) of a voltage `v` (V) at times `t` (s), shape (N,); 0 if it has several."""
+    # The first move and the last one may be cut off.
+    duration = Runs.of(t, v, _dead_band(v)).duration[1:-1]
+    usual = float(np.median(duration)) if duration.size else 0.0
+    alike = usual > 0.0 and np.mean((duration < ALMOST * usual) & (usual < ALMOST * duration)) > MOST_RUNS
+    return 0.5 / usual if alike else 0.0
 
 
 def excited_frequency(evidence: Evidence) -> float:

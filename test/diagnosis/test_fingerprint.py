@@ -57,6 +57,14 @@ def test_frequencies_and_amplitudes_of_lines_are_told():
     assert "50.3 Hz (30" in found[0].evidence or "50.3 Hz (29" in found[0].evidence
 
 
+@pytest.mark.parametrize(("hertz", "told"), [(30.0, False), (33.7, True)])
+def test_a_harmonic_of_the_drive_is_no_line_of_its_own(hertz, told):
+    v = 50 + 40 * np.sin(2 * np.pi * 10.0 * T)
+    noise = NOISE * np.random.default_rng(0).standard_normal(T.size)
+    found = fingerprint([Signals(T, v, 2e-7 * v, SIZE * np.sin(2 * np.pi * hertz * T) + noise)])
+    assert ("lines of the spectrum" in {one.variable for one in found}) is told
+
+
 def test_a_few_periods_are_a_drift_and_no_line():
     slow = np.sin(2 * np.pi * 4.3 / T[-1] * T) + 0.3 * np.random.default_rng(1).standard_normal(T.size)
     assert {"time"} <= {one.variable for one in fingerprint([record(slow, 0)])} - {"lines of the spectrum"}

@@ -195,13 +195,17 @@ BEYOND_CHANCE = 4.0
 OUTLIER = 6.0
 # Number of voltages at which the mid-line of the largest loop is computed.
 LEVELS = 201
+# Steps in which effects that act at a displacement are put where the zero of a record is.
+ALIGNMENTS = 3
 
 
 @dataclass(frozen=True)
 class Match:
     """Comparison of a model with a record of unknown initial state."""
 
+    axis: AxisModel  # the model, with what acts at a displacement where the zero of the record puts it
     start: Start  # with the lowest error; its displacement includes the offset of the record
+    begun: float  # m, its displacement without the offset that is left
     offset: float  # m, zero of the record minus that of the model
     offset_uncertainty: float  # m, half the range of unknown histories plus `BEYOND_CHANCE` standard deviations
     gain_change: float  # relative, of the loop height
@@ -232,6 +236,17 @@ class Match:
 
 def match(axis: AxisModel, samples: Samples, t: FloatArray | None = None, start: Start | None = None) -> Match:
     """Compare a model, from voltage to displacement of the stage, with a record of unknown initial state."""
+    found, moved = _match(axis, samples, t, start), 0.0
+    # What acts at a displacement, such as a contact, moves with the zero.
+    for _ in range(ALIGNMENTS if any(effect.shifted(1.0) != effect for effect in axis.effects) else 0):
+        by = float(found.start.displacement - found.begun)
+        moved += by
+        start = start and replace(start, displacement=start.displacement + by)
+        found = _match(axis.shifted(moved), samples, t, start)
+    return replace(found, offset=moved + found.offset)
+
+
+def _match(axis: AxisModel, samples: Samples, t: FloatArray | None, start: Start | None) -> Match:
     # While the voltage stays within the range visited so far, the unknown initial state adds only a constant, so the
     # samples of such a stretch can be compared with each other. Once both ends of the model's voltage range have been
     # visited, the offset is known as well. `t` (s, (N,)) is needed only with effects.
@@ -257,6 +272,8 @@ def match(axis: AxisModel, samples: Samples, t: FloatArray | None = None, start:
     zero = float(-np.median(residual[last]))
     spread = float(np.ptp(levels)) / 2
     return Match(
+        axis=axis,
+        begun=starts[best].displacement,
         start=replace(starts[best], displacement=starts[best].displacement + zero),
         offset=zero + middle,
         offset_uncertainty=spread + BEYOND_CHANCE * max(axis.quality.held_out_rms, rms_explained),

@@ -423,7 +423,7 @@ def _free_run(
 def _run(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: StartMemory | None, since: float) -> _Run:
     """Simulate an axis on a record from its initial state; samples before `since` (s) are not judged."""
     found, begins_known = _matched(axis, t, samples, start_memory)
-    simulated = replace(axis, start=found.start).simulate(t, samples.v)
+    simulated = replace(found.axis, start=found.start).simulate(t, samples.v)
     # The outliers that `identify` leaves out are no error of the model.
     samples = samples.without_outliers(simulated)
     judged = samples.fitted if begins_known else _judged(samples, found)

@@ -13,6 +13,8 @@ from reports.pages import parsed
 import slpi_ros
 import slpi_ros.io.bag_writer
 from slpi_ros.cli import main
+from slpi_ros.effects.base import EffectContext
+from slpi_ros.effects.contact import Contact
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.io.schemas import validate
@@ -95,6 +97,18 @@ def test_a_moved_zero_is_no_error_of_the_loops(offset, model):
     one = judged(unseen((100, 20, 80), offset=offset), model)
     assert one.passed and one.zero_moved
     assert one.offset == pytest.approx(offset, abs=0.1 * abs(offset))
+
+
+@pytest.mark.parametrize("offset", [-0.93e-6, 0.2e-6])
+def test_a_contact_moves_with_the_zero(offset, model):
+    contact, x = Contact(8e-6, 0.5), model.axes["x"]
+    touching = replace(model, axes={"x": replace(x, effects=(contact,))})
+    record = unseen((100, 20, 80))
+    y = contact.apply(record.displacement["x"], EffectContext(record.t)) + offset
+    one = judged(replace(record, displacement={"x": y}), touching)
+    assert one.passed and one.zero_moved
+    assert one.offset == pytest.approx(offset, abs=0.1 * abs(offset))
+    assert one.rest.rms < 1.1 * judged(record, model).rest.rms
 
 
 def test_a_tolerance_holds_for_the_absolute_error(model):

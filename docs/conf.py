@@ -32,7 +32,8 @@ html_show_sourcelink = False
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 
-MARKER = re.compile(r"^<!-- generated: ([\w-]+)(?: (.+?))? -->$", re.MULTILINE)
+# The line below a marker is for those who read the files.
+MARKER = re.compile(r"^<!-- generated: ([\w-]+)(?: (.+?))? -->(?:\n\*In these files: .+\*)?$", re.MULTILINE)
 UPWARDS = re.compile(r"\[([^\]]*)\]\((\.\./[\w./-]+)(#[\w-]+)?\)")
 
 

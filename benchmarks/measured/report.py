@@ -88,7 +88,7 @@ class Comparison:
 
     ratios: tuple[float, ...]
     absolute: tuple[float, ...]
-    wins: int  # significantly less, 95 %
+    wins: int  # below the other's 95 % interval
     losses: int
 
     def __str__(self) -> str:
@@ -96,8 +96,8 @@ class Comparison:
         ties = len(self.ratios) - self.wins - self.losses
         return (
             f"median {np.median(self.ratios):.2f}, worst {max(self.ratios):.2f} (offset included "
-            f"{np.median(self.absolute):.2f} and {max(self.absolute):.2f}); significantly less in {self.wins} rows, "
-            f"no different in {ties}, more in {self.losses}"
+            f"{np.median(self.absolute):.2f} and {max(self.absolute):.2f}); below its 95 % interval in {self.wins} "
+            f"rows, no clear difference in {ties}, the other below that of *SLPI, causes* in {self.losses}"
         )
 
 
@@ -129,7 +129,7 @@ def headline(rows: Rows, shown: Iterable[str]) -> str:
         f"Error of *SLPI, causes* in all {len(rows)} rows, over that of the best **other** method, chosen afterwards "
         f"for each row: {compared(rows)}. In the rows shown here the median is {few:.2f}. Over that of PI: "
         f"{compared(rows, ['PI'])}. Over that of PI with a lag: {compared(rows, ['PI, lag'])}. The causes make SLPI "
-        f"significantly better in {causes.wins} rows and worse in {causes.losses}, at worst by a factor of "
+        f"clearly better, in this sense, in {causes.wins} rows and worse in {causes.losses}, at worst by a factor of "
         f"{max(causes.ratios):.2f}. A fit takes {fit:.0f} s on one core, a sample {sample:.2f} µs (medians)."
     )
 

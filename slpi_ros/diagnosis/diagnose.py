@@ -175,7 +175,7 @@ def _diagnose_axis(
     given = _given(model, runs, found)
     extension = _extension(model, found, given, source)
     opponents = _opponents(model, found.base, runs, source) if extension else []
-    while extension and not _carries_over(extension.judged, opponents):
+    while extension and not _carries_over(extension.judged, runs, opponents):
         # What makes a record worse is neither named nor in the model.
         if not found.named:
             extension = None
@@ -264,9 +264,13 @@ def _own(model: AxisModel, evidence: Evidence) -> Mask:
     return np.array([part.source in model.quality.sources for part in evidence.parts])
 
 
-def _carries_over(after: Sequence[FreeRun], opponents: Sequence[float]) -> bool:
-    """Return whether the free runs of an extended model exceed errors (m, rms) on no record."""
-    return all(one.rms <= NO_WORSE * before for one, before in zip(after, opponents, strict=True))
+def _carries_over(after: Sequence[FreeRun], before: Sequence[FreeRun], opponents: Sequence[float]) -> bool:
+    """Return whether an extended model is worse than the given one neither on all records nor than an opponent on one.
+
+    `after` and `before` are the free runs of both models, `opponents` the errors (m, rms) on each record.
+    """
+    on_each = all(one.rms <= NO_WORSE * opponent for one, opponent in zip(after, opponents, strict=True))
+    return on_each and rms_of(after) <= NO_WORSE * rms_of(before)
 
 
 def _answer(base: JointFit, of_family: Evidence | None) -> Answer:

@@ -98,6 +98,10 @@ class EachRecord(EffectBase):
         yield from ()
 
 
+# Largest standard deviation that a model document holds: of what is not determined at all.
+LEAST_KNOWN = 1e12
+
+
 def _fitted(effect: Effect) -> list[tuple[str, Fit, float]]:
     """Return place, kind of fit and value of each free parameter, such as ``modes.0.gain``."""
     return [(leaf.place, leaf.facts.fit, leaf.value) for leaf in effect.free_leaves() if leaf.facts.fit]
@@ -152,7 +156,7 @@ def certain(effect: Effect, spread: Sequence[float]) -> Effect:
         left = list(spread)
         return EachRecord(tuple(certain(part, [left.pop(0) for _ in part.free_leaves()]) for part in effect.parts))
     found = {
-        place: deviation * (value if fit.kind == "logarithmic" else 1.0)
+        place: min(deviation * (value if fit.kind == "logarithmic" else 1.0), LEAST_KNOWN)
         for (place, fit, value), deviation in zip(_fitted(effect), spread, strict=True)
     }
     return replace(effect, uncertainty=found)  # type: ignore[type-var]

@@ -257,7 +257,7 @@ def _of_lines(records: Sequence[Signals]) -> Iterator[Left]:
         for record, lines in zip(records, found, strict=True)
     ]
     share, _ = _share(scipy.linalg.block_diag(*columns), records)
-    told = []
+    told = dict[str, str]()
     for lines, own, record in zip(found, columns, records, strict=True):
         if not lines:
             continue
@@ -265,14 +265,16 @@ def _of_lines(records: Sequence[Signals]) -> Iterator[Left]:
         heights = np.hypot(*gains.T).tolist()
         # Beside a strong line are weak ones that its amplitude, not quite constant, makes.
         tall = [each for each in zip(lines, heights, strict=True) if each[1] >= TALL * max(heights)]
-        told += [f"{frequency:.4g} Hz ({length(height)})" for frequency, height in tall]
+        for frequency, height in tall:
+            told.setdefault(f"{frequency:.3g}", f"{frequency:.4g} Hz ({length(height)})")
     name = "lines of the spectrum"
     # No mains and no pump is so slow.
     slow = max(frequency for lines in found for frequency in lines) < SLOW
     advice = (
         "look for what comes and goes so slowly, such as an air conditioning, and record it" if slow else HINTS[name]
     )
-    yield Left(name, share, f"{share:.0%} of the mean square is in lines at {', '.join(told[:MOST_LINES])}; {advice}")
+    listed = ", ".join([*told.values()][:MOST_LINES])
+    yield Left(name, share, f"{share:.0%} of the mean square is in lines at {listed}; {advice}")
 
 
 def _lines(record: Signals) -> list[float]:

@@ -192,6 +192,11 @@ def _summary(record: Record, desired: Mapping[str, FloatArray], choice: ColumnCh
         displacement = _column_summary(choice.displacement[axis], record.displacement[axis] * 1e6, "µm")
         wanted = _column_summary(choice.desired[axis], desired[axis] * 1e6, "µm") if axis in desired else ""
         yield f"axis {axis}: {voltage}, {displacement}{', desired ' + wanted if wanted else ''}"
+        if is_line(record.voltage[axis], record.displacement[axis]):
+            yield (
+                f"axis {axis}: the displacement is a straight line of '{choice.voltage[axis].name}', without "
+                "hysteresis: is this a monitor of the sensor? The voltage must be that of the drive (--voltage)"
+            )
     for name, (_, readings) in record.surroundings.items():
         yield f"quantity {name}: {readings.size} readings"
     for name in choice.monitors:

@@ -25,7 +25,7 @@ from slpi_ros.model.document import format_model
 from slpi_ros.reports import views
 from slpi_ros.reports.chart import AFTER, BEFORE, CAUSES, DISPLACEMENT, ERROR, NOISE, Chart, Panel, Quantity
 from slpi_ros.reports.page import Page, Severity, Share
-from slpi_ros.reports.text import above_noise
+from slpi_ros.reports.text import NO_DRIVE, above_noise, is_straight
 from slpi_ros.reports.views import Motion, Series
 
 # Relative difference of equal errors.
@@ -304,6 +304,8 @@ def diagnosis_limits(diagnosis: Diagnosis) -> dict[str, str]:
             causes.append("a cause that is none of the known effects")
         if not causes and above_noise(found.given_rms, found.noise_rms, high - low):
             causes.append("a model that does not fit the stage as it is now")
+        if not causes and is_straight(diagnosis.extended.axes[name]):
+            causes.append(NO_DRIVE)
         if causes:
             limits[name] = ", ".join(causes)
     return limits

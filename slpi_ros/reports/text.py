@@ -19,6 +19,13 @@ if TYPE_CHECKING:
 
 # Noise of a sensor, rms, as a share of the displacement range, beyond which it limits what a model can promise.
 NOISY = 0.005
+# Voltages of a branch at which a loop is compared with a straight line.
+LEVELS = 201
+# What is said of a voltage of which the displacement is a straight line.
+NO_DRIVE = (
+    "the voltage: the displacement is a straight line of it, without hysteresis, as of a monitor of the sensor; the "
+    "voltage must be that of the drive"
+)
 
 
 def verdict(limits: Mapping[str, str], good: str = "at the sensor noise") -> str:
@@ -45,9 +52,22 @@ def model_limits(model: StageModel) -> dict[str, str]:
         error = quality.held_out_rms if np.isfinite(quality.held_out_rms) else quality.rms
         if limit := above_noise(error, quality.floor_rms, high - low):
             limits[name] = f"{limit}, of unknown cause"
+        elif is_straight(axis):
+            limits[name] = NO_DRIVE
         elif (share := quality.floor_rms / (high - low)) > NOISY:
             limits[name] = f"the sensor, whose noise of {length(quality.floor_rms)} rms is {share:.1%} of the range"
     return limits
+
+
+def is_straight(axis: AxisModel) -> bool:
+    """Return whether the largest loop of a model is a straight line but for noise."""
+    if not axis.causal:
+        return False
+    rise = np.linspace(*axis.hysteresis_range, LEVELS)
+    v = np.concatenate([rise[-1:], rise, rise[::-1]])
+    y = axis.hysteresis_only.simulate(np.zeros(v.size), v)[1:]
+    bent = y - np.polyval(np.polyfit(v[1:], y, 1), v[1:])
+    return float(np.sqrt(np.mean(bent**2))) <= ABOVE_NOISE * axis.quality.floor_rms
 
 
 def change_limits(changes: Mapping[str, "AxisChange"], model: StageModel) -> dict[str, str]:

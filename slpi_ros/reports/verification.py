@@ -57,6 +57,7 @@ _FEWEST_SIZES = 3
 # Largest number of times that are told.
 MOST_TIMES = 3
 LINES, ZERO = "line interference or vibration", "the zero"
+FOREIGN = "another stage, or of other units"
 
 
 def write_files(folder: Path, found: Verification) -> None:
@@ -123,6 +124,8 @@ def _limiting(record: RecordVerification) -> str:
     """Return what makes most of the error of a record that fails."""
     if record.lacking:
         return f"{', '.join(record.lacking)}, which the model follows and the record does not hold"
+    if record.foreign:
+        return FOREIGN
     if record.absolute and record.zero_moved and record.constant**2 > record.error.rms**2 / 2:
         return ZERO
     share = record.lines.share if record.lines else 0.0
@@ -136,7 +139,8 @@ def verification_good(found: Verification) -> str:
     records = [record for axis in found.axes.values() for record in axis.records]
     noise = all(record.error.rms <= ABOVE_NOISE * record.repeatability_rms for record in records)
     lines = max((record.lines.share for record in records if record.lines), default=0.0)
-    good = "at the repeatability of the record" if noise else "within its limit on every record"
+    offset = "" if all(record.absolute for record in records) else ", offset left out"
+    good = "at the repeatability of the record" if noise else f"within its limit on every record{offset}"
     return f"{good}{f'; {lines:.0%} of the mean square error is {LINES}' if lines else ''}"
 
 
@@ -176,6 +180,8 @@ def _summary(axis: AxisVerification) -> str:
     if axis.verdict == UNPROVED:
         return f"{said} {_why_unproved(axis.unproved)}"
     limit = _limiting(axis.worst)
+    if limit == FOREIGN:
+        return f"{said} The model is of {FOREIGN}: its gain is off by {axis.worst.gain:.0%}; give this stage's model."
     if limit == LINES:
         return f"{said} It is {LINES}, no error of the model."
     if limit == ZERO:

@@ -101,6 +101,11 @@ class RecordVerification:
         return float(np.sqrt(max(self.repeatability_rms**2, lines)))
 
     @property
+    def foreign(self) -> bool:
+        """Whether the loops are more than twice or less than half as high: another stage, or other units."""
+        return not 0.5 <= 1.0 + self.gain <= 2.0
+
+    @property
     def judged_error(self) -> float:
         """Rms error that is compared with the limit, metres."""
         return self.error.rms if self.absolute else self.rest.rms

@@ -83,7 +83,7 @@ def test_of_a_mirror_without_hysteresis_a_mode_is_named(measured_data, given):
     diagnosis = slpi_ros.diagnose(sines, model)
     (found,) = diagnosis.axes.values()
     assert [(one.name, one.alternatives) for one in found.effects] == [("resonance", ())]
-    mode = max(found.effects[0].effect.modes, key=lambda one: one.share)
+    mode = max(found.effects[0].effect.modes, key=lambda one: one.gain)
     # Its own steps: 6.2 and 7.0 Hz.
     assert mode.frequency == pytest.approx(6.6, rel=0.1)
     square = import_table(measured_data / "mirror_square_250mv.csv")

@@ -7,7 +7,7 @@ import pytest
 from effects.cases import EVERY
 from hypothesis import given
 
-from slpi_ros.diagnosis.effect_parameters import EachRecord, bounded, certain, free, moved, names, steps
+from slpi_ros.diagnosis.effect_parameters import LEAST_KNOWN, EachRecord, bounded, certain, free, moved, names, steps
 from slpi_ros.effects.base import is_course
 from slpi_ros.effects.parameters import facts_of
 from slpi_ros.effects.rate_dependence import RateDependence
@@ -51,6 +51,8 @@ def test_a_start_that_is_none_stays_none():
 def test_the_uncertainty_of_a_logarithm_is_in_the_unit_of_the_parameter():
     law = certain(RateDependence(2.0, 0.5, 1e-8), [0.1, 0.2, 3e-9])
     assert law.uncertainty == pytest.approx({"threshold": 0.2, "onset_rate": 0.1, "reversible_gain": 3e-9})
+    # What is not determined at all has a place in a document, too.
+    assert certain(RateDependence(2.0, 0.5, 1e-8), [1e200, 0.2, 3e-9]).uncertainty["threshold"] == LEAST_KNOWN
 
 
 @pytest.mark.parametrize("name", EFFECTS)

@@ -12,7 +12,7 @@ from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.reports.text import describe_axis, model_limits
 
-SHAPE = PrandtlIshlinskii(np.array([0.0, 1.0]), np.array([1e-7, 1e-7]))
+SHAPE = PrandtlIshlinskii(np.array([0.0, 0.2]), np.array([4e-7, 4e-7]))
 
 
 @pytest.mark.parametrize(("noise", "error", "limited"), [(1e-9, 1e-9, False), (2e-8, 2e-8, True), (1e-9, 1e-8, True)])

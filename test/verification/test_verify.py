@@ -194,6 +194,12 @@ def test_line_interference_is_no_hysteresis_of_a_path(model):
     assert limits.startswith("line interference") and "the path, 3" in limits
 
 
+@pytest.mark.parametrize(("gain", "foreign"), [(1e-3, True), (0.8, False), (1.3, False), (1e3, True)])
+def test_loops_of_quite_another_height_are_those_of_another_stage(gain, foreign, model):
+    one = judged(unseen(gain=gain), model)
+    assert not one.passed and one.foreign is foreign
+
+
 @pytest.mark.parametrize("gain", [0.99, 1.02])
 def test_a_changed_gain_fails_and_is_no_moved_zero(gain, model):
     one = judged(unseen(gain=gain), model)

@@ -419,7 +419,11 @@ def is_line(x: FloatArray, y: FloatArray, fewest: int = FEWEST_FOR_A_LINE) -> bo
     x, y = x[both], y[both]
     if x.size < fewest or not (np.ptp(x) and np.ptp(y)):
         return False
-    x, y = (x - x.mean()) / np.std(x), (y - y.mean()) / np.std(y)
+    with np.errstate(over="ignore", invalid="ignore"):
+        x, y = (x - x.mean()) / np.std(x), (y - y.mean()) / np.std(y)
+    # Damaged values may be too far apart to be compared.
+    if not (np.isfinite(x).all() and np.isfinite(y).all() and np.ptp(x) and np.ptp(y)):
+        return False
     rest = y - np.mean(x * y) * x
     steps = [np.diff(np.unique(signal)) for signal in (x, y)]
     digits = max(float(step.min()) for step in steps)

@@ -148,13 +148,13 @@ class Outcome:
 
 def run(case: Case, beside: Path | None = None) -> list[Outcome]:
     """Hide, identify, diagnose, and compare; the outcome of this commit, and that of the clone `beside`."""
-    stage = _drawn(case)
     try:
-        outcomes = [_outcome(case, stage)]
+        stage = _drawn(case)
+        return [_outcome(case, stage), *([_outcome_beside(case, stage, beside)] if beside else [])]
     # One failing case must not end a long run; it is printed and counts as wrong.
     except Exception as error:
-        outcomes = [Outcome(case, "failed", (), 0.0, 0.0, "", 0.0, f"{type(error).__name__}: {error}"[:150])]
-    return outcomes + ([_outcome_beside(case, stage, beside)] if beside else [])
+        failed = Outcome(case, "failed", (), 0.0, 0.0, "", 0.0, f"{type(error).__name__}: {error}"[:150])
+        return [failed] * (2 if beside else 1)
 
 
 def _outcome(case: Case, stage: "Drawn") -> Outcome:

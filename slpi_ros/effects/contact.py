@@ -62,7 +62,8 @@ class Contact(EffectBase):
 
     def plausible(self, context: FitContext) -> bool:
         """Return whether the stage is again and again on either side of the position."""
-        beyond = float(np.mean(context.y[context.used & ~context.first_rise()] > self.position))
+        y = context.y[context.used & ~context.first_rise()]
+        beyond = float(np.mean(y > self.position)) if y.size else 0.0
         return LEAST_SHARE <= beyond <= 1.0 - LEAST_SHARE
 
     def shifted(self, by: float) -> Self:

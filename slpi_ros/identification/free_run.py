@@ -193,7 +193,7 @@ PARTS = 10
 BEYOND_CHANCE = 4.0
 # Errors beyond this many robust standard deviations are outliers.
 OUTLIER = 6.0
-# Number of voltages at which the mid-line of the largest loop is computed.
+# Number of voltages at which the largest loop is computed.
 LEVELS = 201
 # Steps in which effects that act at a displacement are put where the zero of a record is.
 ALIGNMENTS = 3
@@ -315,6 +315,14 @@ def ways_to(low: float, high: float, v: float) -> list[tuple[float, ...]]:
     return [*ways, (low, *decay.tolist())]
 
 
+def largest_loop(axis: AxisModel, low: float, high: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Return voltages from `low` to `high` (V) and the displacements (m) there, rising and falling, (LEVELS,) each."""
+    rise = np.linspace(low, high, LEVELS)
+    loop = np.concatenate([rise[-1:], rise, rise[::-1]])
+    _, rising, falling = np.split(axis.hysteresis_only.simulate(np.zeros(loop.size), loop), [1, 1 + rise.size])
+    return rise, rising, falling[::-1]
+
+
 def _possible_starts(axis: AxisModel, v: float) -> list[Start]:
     """Return possible hysteresis states at the voltage `v` (V), including the two extreme states."""
     if not axis.causal:
@@ -360,10 +368,8 @@ def _changes(
     if np.count_nonzero(known) < FEWEST:
         return np.zeros(2), np.full(2, np.inf), axis.quality.held_out_rms, axis.quality.held_out_rms
     # Mid-line of the largest loop: the mean of its rising and its falling branch.
-    rise = np.linspace(*axis.voltage_range, LEVELS)
-    loop = np.concatenate([rise[-1:], rise, rise[::-1]])
-    _, rising, falling = np.split(axis.hysteresis_only.simulate(np.zeros(loop.size), loop), [1, 1 + rise.size])
-    middle = np.interp(samples.v, rise, (rising + falling[::-1]) / 2)
+    levels, rising, falling = largest_loop(axis, *axis.voltage_range)
+    middle = np.interp(samples.v, levels, (rising + falling) / 2)
     # A lag or delay, and a slow drift, change neither gain nor width.
     speed = np.gradient(predicted, np.maximum.accumulate(t + 1e-9 * np.arange(t.size)))
     columns = np.column_stack([predicted, predicted - middle, speed, t])[known]

@@ -10,6 +10,7 @@ from slpi_ros.hysteresis.kinds import DESCRIPTIONS, Hysteresis
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.multi_slope import AmplitudeScaled
 from slpi_ros.hysteresis.slpi_published import SeparatedLoops
+from slpi_ros.identification.free_run import largest_loop
 from slpi_ros.model.axis_model import ABOVE_NOISE, RESOLUTION, AxisModel, StartMemory
 from slpi_ros.model.coverage import fastest_displacement
 from slpi_ros.model.stage_model import StageModel
@@ -19,8 +20,6 @@ if TYPE_CHECKING:
 
 # Noise of a sensor, rms, as a share of the displacement range, beyond which it limits what a model can promise.
 NOISY = 0.005
-# Voltages of a branch at which a loop is compared with a straight line.
-LEVELS = 201
 # What is said of a voltage of which the displacement is a straight line.
 NO_DRIVE = (
     "the voltage: the displacement is a straight line of it, without hysteresis, as of a monitor of the sensor; the "
@@ -63,10 +62,9 @@ def is_straight(axis: AxisModel) -> bool:
     """Return whether the largest loop of a model is a straight line but for noise."""
     if not axis.causal:
         return False
-    rise = np.linspace(*axis.hysteresis_range, LEVELS)
-    v = np.concatenate([rise[-1:], rise, rise[::-1]])
-    y = axis.hysteresis_only.simulate(np.zeros(v.size), v)[1:]
-    bent = y - np.polyval(np.polyfit(v[1:], y, 1), v[1:])
+    v, *branches = largest_loop(axis, *axis.hysteresis_range)
+    v, y = np.append(v, v), np.concatenate(branches)
+    bent = y - np.polyval(np.polyfit(v, y, 1), v)
     return float(np.sqrt(np.mean(bent**2))) <= ABOVE_NOISE * axis.quality.floor_rms
 
 

@@ -4,8 +4,8 @@
 
 PI, SLPI, SLPI with causes: the commands ``slpi import``, ``identify``, ``diagnose``, and what ``slpi verify`` computes.
 All others: slow implementations from the equations in plain NumPy, one sample after the other, with solvers of SciPy.
-They take delay, lag and shape that the method found (PI with a lag searches its own) and the history that it was given,
-find their weights anew, and simulate the judged record. A ratio beyond `AGREES` is marked with ``!``.
+They take delay, lag, shape and penalty that the method found (PI with a lag searches its own) and the history that it
+was given, find their weights anew, and simulate the judged record. A ratio beyond `AGREES` is marked with ``!``.
 """
 
 import os
@@ -151,11 +151,11 @@ def columns_behind(model: LinearModel, one: Series, history: History, lags: tupl
 
 
 def weights_of(
-    columns: Sequence[FloatArray], ys: Sequence[FloatArray], free: int, ridges: Sequence[float]
+    columns: Sequence[FloatArray], ys: Sequence[FloatArray], free: int, ridges: Sequence[float], largest: bool = False
 ) -> FloatArray:
     """Return the weights (C,), of which those after the first `free` are not negative; each record has a constant.
 
-    Of several ridges the largest within one standard error of the one that predicts fifths left out best.
+    Of several ridges that which predicts fifths left out best, or the `largest` within one standard error of it.
     """
     a = np.vstack([own - own.mean(axis=0) for own in columns])
     b = np.concatenate([y - y.mean() for y in ys])
@@ -175,7 +175,10 @@ def weights_of(
             for one in ridges
         ]
     )
-    best = errors[int(np.argmin(errors.mean(axis=1)))]
+    chosen = int(np.argmin(errors.mean(axis=1)))
+    if not largest:
+        return solved(a, b, ridges[chosen])
+    best = errors[chosen]
     as_good = errors.mean(axis=1) <= best.mean() + np.std(best, ddof=1) / np.sqrt(5.0)
     return solved(a, b, max(one for one, good in zip(ridges, as_good, strict=True) if good))
 
@@ -190,7 +193,8 @@ def linear(model: LinearModel, records: Sequence[Series], one: Series, history: 
         columns = [
             columns_behind(model, own, own.history, lags)[at][::thin] for own, at in zip(records, used, strict=True)
         ]
-        return weights_of(columns, ys, getattr(model.features, "free", 0), ridges), columns
+        alone = isinstance(model.features, Plays | RatePlays)
+        return weights_of(columns, ys, getattr(model.features, "free", 0), ridges, alone), columns
 
     lags = model.delay, model.lag
     if search:
@@ -203,8 +207,9 @@ def linear(model: LinearModel, records: Sequence[Series], one: Series, history: 
 
         found = minimize(cost, (1.0, 2.0), method="Nelder-Mead", options={"maxfev": 40})
         lags = abs(found.x[0]) * period, abs(found.x[1]) * period
-    # Play operators have the ridges of the method, others hardly any.
-    ridges = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2) if isinstance(model.features, Plays | Creep | RatePlays) else (1e-5,)
+    # Those of the method, but for Bouc-Wen and lines, whose few weights need none.
+    many = isinstance(model.features, Plays | Creep | RatePlays | EnvelopePlays | Preisach)
+    ridges = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2) if many else (1e-6,)
     return columns_behind(model, one, history, lags) @ fit(lags, ridges)[0]
 
 
@@ -218,7 +223,7 @@ def modified(model: ModifiedModel, records: Sequence[Series], one: Series, histo
     y = np.concatenate([own.y[at][::thin] for own, at in zip(records, used, strict=True)]) / base.scale.y_range
     number = np.concatenate([np.full(len(own), k) for k, own in enumerate(columns)])
     x, thresholds, plays = np.vstack(columns), np.linspace(-0.4, 0.4, 9), columns[0].shape[1]
-    last = plays + 2 + thresholds.size
+    last, heavy = plays + 2 + thresholds.size, np.sqrt(model.penalty * y.size)
 
     def shaped(p: FloatArray, x: FloatArray) -> FloatArray:
         # The weights of the dead zones are the changes of the slopes, which stay positive.
@@ -227,7 +232,8 @@ def modified(model: ModifiedModel, records: Sequence[Series], one: Series, histo
         return np.asarray(slopes[0] * inner + zones @ np.diff(slopes))
 
     def residual(p: FloatArray) -> FloatArray:
-        return np.asarray(shaped(p, x) + p[last:][number] - y)
+        wide, bends = p[1:plays], np.diff(p[plays + 1 : last])
+        return np.concatenate([shaped(p, x) + p[last:][number] - y, heavy * wide, heavy * bends])
 
     ys = [y[number == k] for k in range(len(columns))]
     ends = [float(np.mean(own)) for own in ys]

@@ -175,12 +175,14 @@ class Axis:
     def locate(self, voltage: float, now_ns: int) -> None:
         """Continue from a voltage (V) at which the amplifier was found; a move to it that is no noise is remembered.
 
-        Before the first voltage, the measurements choose among the initial states.
+        When it moved is not known: the effects are taken to be in equilibrium there. Before the first voltage, the
+        measurements choose among the initial states.
         """
         assert self.model
-        if abs(voltage - self.stream.voltage) > self.amplifier.tolerance():
+        moved = abs(voltage - self.stream.voltage) > self.amplifier.tolerance()
+        if moved:
             self.loop.leave(self.stream)
-            self.stream.drive(voltage)
+            self.stream.rest_at(voltage)
             if self.confidence.state != RESETTING:
                 self.confidence = MemoryConfidence(
                     doubt=f"moved to {volts(voltage)} V by something else since its memory was known"
@@ -188,7 +190,9 @@ class Axis:
         if voltage != self.output.voltage:
             self.output.start(voltage)
         self.stream.pace = self.output
-        if self.loop.closed:
+        if self.loop.closed and moved:
+            self.loop.close(self.stream, self.samples.given_ns)
+        elif self.loop.closed:
             self.loop.restart(self.stream, self.samples.given_ns)
         chosen, confidence = self.initial.choose(self.model, self.limits, self.stream, self.surroundings, now_ns)
         self.confidence = confidence or self.confidence

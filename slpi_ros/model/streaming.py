@@ -68,24 +68,32 @@ class StreamingInverse:
         self.timeless = not self._streaming  # whether the model does not depend on time
         self.pace = RateLimiter(limits, MAX_DT / 2)
         self.limits = limits
+        # Shortfall of the last sample: of the hysteresis or the voltage (m or V), and of the axis as a whole (m).
+        self._missing = self._short = 0.0
         # The axis may start outside its limits; the first output voltage is inside.
-        memory.forward(self.limits.clip(memory.voltage))
-        self.pace.start(memory.voltage)
+        self.rest_at(self.limits.clip(memory.voltage))
+
+    def rest_at(self, voltage: float) -> float:
+        """Continue from a voltage (V) at which the stage rests, all effects in equilibrium; return where it is (m)."""
+        if voltage != self.pace.voltage:
+            self.pace.start(voltage)
+        self._command = felt = voltage
         for streaming in self._before.values():
-            streaming.start(memory.voltage)
+            streaming.start(felt)
+            felt = streaming.forward(0.0, felt)
+        felt = min(max(felt, self._clipped[0]), self._clipped[1])
         if self._around:
-            self._around.start(memory.voltage)
-        for streaming in self._driven:
-            streaming.reach(self._applied)
-        y = memory.displacement
+            self._around.start(felt)
+        self.memory.forward(felt)
+        if self._driven:
+            for streaming in self._driven:
+                streaming.reach(self._applied)
+        y = self._inside
         for streaming in self._behind.values():
             streaming.start(y)
             y = streaming.forward(0.0, y)
-        self._command = memory.voltage
-        self.desired = memory.displacement
-        # Shortfall of the last sample: of the hysteresis or the voltage (m or V), and of the axis as a whole (m).
-        self._missing = self._short = 0.0
-        self._follow(0.0)
+        self.desired, self._missing, self._displacement = self._inside, 0.0, y
+        return y + self.coupled
 
     @property
     def _streaming(self) -> "dict[str, StreamingEffect | StreamingAround]":

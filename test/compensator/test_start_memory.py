@@ -9,6 +9,10 @@ from strategies import FAMILY_CASE, axis_model
 from slpi_ros.compensator.controller import Controller
 from slpi_ros.compensator.model_swap import take_over
 from slpi_ros.compensator.persistence import ASSUMED, RESTORED, SavedAxis
+from slpi_ros.effects.creep import Creep
+from slpi_ros.effects.filters import Mode
+from slpi_ros.effects.lag import Lag
+from slpi_ros.effects.resonance import Resonance
 from slpi_ros.model.axis_model import START_MEMORIES
 from slpi_ros.model.limits import Limits
 from slpi_ros.model.stage_model import StageModel
@@ -136,3 +140,37 @@ def test_a_saved_memory_has_precedence():
 def test_a_model_that_does_not_tell_its_end_starts_at_its_start():
     made = controller("end", PLAIN)
     assert memory_of(made).snapshot() == PLAIN.memory("start").snapshot()
+
+
+@pytest.mark.parametrize(
+    "effect", [Lag(0.05), Resonance((Mode(9.0, 0.04),)), Creep((5.0,), (0.05,))], ids=lambda e: e.name
+)
+@pytest.mark.parametrize("read", [0, 9], ids=["no reading", "readings"])
+def test_a_stage_that_is_found_elsewhere_rests_there(effect, read):
+    """A mode that rang from 0 V to where the amplifier was put the zero of the first reset off by 1.5 % of stroke."""
+    model = replace(MODEL, effects=(effect,))
+    made = controller("wiped", model)
+    axis = made.axes[0]
+    for k in range(read):
+        made.measure(["x"], [MEMORIES["wiped"].displacement], k * MS)
+        made.locate(k * MS)
+    axis.locate(80.0, 10 * MS)
+    there = take_over(model, LIMITS, (), "wiped")
+    there.drive(80.0)
+    there.wait(1e5)
+    assert axis.voltage == 80.0 and axis.expected == pytest.approx(there.drive(80.0), abs=1e-12)
+    for k in range(20, 60):
+        axis.drive(80.0, k * MS)
+        assert axis.expected == pytest.approx(there.drive(80.0), abs=1e-12)
+
+
+def test_the_memory_is_chosen_where_the_amplifier_is_found_behind_a_mode():
+    model = replace(MODEL, effects=(Resonance((Mode(9.0, 0.04),)),))
+    made = controller("end", model)
+    axis, memory = made.axes[0], MODEL.memory("wiped")
+    memory.forward(80.0)
+    for k in range(5):
+        made.measure(["x"], [memory.displacement + 5e-9], k * MS)
+    axis.locate(80.0, 5 * MS)
+    assert not axis.confidence.contradicted
+    assert axis.expected == pytest.approx(memory.displacement, abs=20e-9)

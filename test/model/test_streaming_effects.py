@@ -78,6 +78,26 @@ def test_what_is_streamed_gives_the_wish(effects):
 
 
 @pytest.mark.parametrize("effects", SETS, ids=ids)
+@given(voltage=st.floats(5.0, 95.0))
+@settings(max_examples=10)
+def test_a_stage_that_is_found_at_rest_stays_where_it_is(effects, voltage):
+    """Whatever the stream followed before, nothing rings or relaxes from there."""
+    axis = with_effects(*effects)
+    stream = axis.stream()
+    followed(stream, path()[:200], T[:200])
+    stream.wait(1e5)
+    moved = stream.copy()
+    moved.drive(voltage, 0.01)
+    for _ in range(5):
+        moved.wait(1e5)
+    there = stream.rest_at(voltage)
+    assert stream.voltage == stream.pace.voltage == voltage
+    assert there == pytest.approx(moved.drive(voltage), abs=1e-12)
+    for _ in range(20):
+        assert stream.drive(voltage, 0.01) == pytest.approx(there, abs=1e-12)
+
+
+@pytest.mark.parametrize("effects", SETS, ids=ids)
 def test_the_stream_knows_where_the_model_is(effects):
     """What it says of its own displacement is what the model makes of its voltages, limits or not."""
     axis = with_effects(*effects)

@@ -129,6 +129,7 @@ class ModifiedModel:
     base: LinearModel
     knots: FloatArray
     values: FloatArray
+    penalty: float  # one of `PENALTIES`
 
     def simulate(self, name: str, t: FloatArray, v: FloatArray, history: tuple[float, ...]) -> FloatArray:
         """Return the displacement, shape (N,)."""
@@ -178,10 +179,11 @@ class ModifiedMethod:
                 one = self._best(columns[kept], coarse.y[kept], number, share)
                 bent = _bent(columns[left_out] @ one.weights, one.knots, one.values)
                 errors[k] += float(np.var(bent - coarse.y[left_out]))
-        best = self._best(columns, coarse.y, coarse.record, PENALTIES[int(np.argmin(errors))])
+        penalty = PENALTIES[int(np.argmin(errors))]
+        best = self._best(columns, coarse.y, coarse.record, penalty)
         own_constants = {one.name: float(c) for one, c in zip(records, best.constants, strict=True)}
         base = LinearModel(features, coarse.scale, best.weights, own_constants, delay, lag)
-        return ModifiedModel(base, best.knots, best.values)
+        return ModifiedModel(base, best.knots, best.values, penalty)
 
     def _best(self, columns: FloatArray, y: FloatArray, record: IntArray, share: float) -> "_Bent":
         """Return the fit with this penalty: the better one of two starts."""

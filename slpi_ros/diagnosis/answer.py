@@ -9,12 +9,12 @@ from slpi_ros.diagnosis.held_out import Loss
 from slpi_ros.diagnosis.joint_fit import JointFit
 from slpi_ros.diagnosis.prepare import one_speed
 from slpi_ros.diagnosis.ruler import EXPLAINED, beats, chance, share
-from slpi_ros.diagnosis.search import CONVERGED, MOST_EFFECTS, EffectSet, Form, Library, Search, is_plausible
+from slpi_ros.diagnosis.search import CONVERGED, MOST_EFFECTS, PLACES, EffectSet, Form, Library, Search, is_plausible
 from slpi_ros.diagnosis.structures import STRUCTURES
 from slpi_ros.model.axis_model import ABOVE_NOISE
 
-# Other effects that are fitted in the place of one.
-RIVALS = 4
+# Other effects that are fitted in the place of one: as many as single ones in a round of the search.
+RIVALS = PLACES[0][1]
 
 
 @dataclass(frozen=True)

@@ -37,9 +37,8 @@ from slpi_ros.model.stage_model import StageModel
 # Kinds that are refitted together with the effects. Any other kind is reported as unsuitable if its error exceeds that
 # of the loop family by this factor.
 REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
-# Gauss-Newton steps of the selected effects with the hysteresis of the given model, which has more vertices; largest
-# ratio, either way, of the errors of the coarser one and with it that are as good.
-REFINED, COARSER = 3, 1.05
+# Gauss-Newton steps of the selected effects with the hysteresis of the given model, which has more vertices.
+REFINED = 3
 # A stage has changed if a new fit leaves at most this multiple of what the model left of its own records, or at most
 # this share of what the model leaves: else something else than the hysteresis is the matter.
 AS_ONCE, LITTLE = 1.5, 0.2
@@ -284,7 +283,7 @@ def _answer(base: JointFit, of_family: Evidence | None) -> Answer:
     # A smoothness that suits few vertices may leave many without any hold.
     finer = replace(answer.now.evidence, basis=finest.basis, smoothness=evidence.smoothness)
     now = JointFit(finer, answer.now.effects).smoothed().refined(REFINED)
-    as_good = now.held_out.rms <= COARSER * answer.now.held_out.rms
+    as_good = now.held_out.rms <= NO_WORSE * answer.now.held_out.rms
     return replace(answer, base=base, now=now) if as_good else answer
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from slpi_ros.arrays import FloatArray
 from slpi_ros.diagnosis.effect_parameters import EachRecord, free
 from slpi_ros.diagnosis.held_out import RIDGE, HeldOut, Loss
-from slpi_ros.diagnosis.joint_fit import JointFit
+from slpi_ros.diagnosis.joint_fit import MOST_TURNS, JointFit
 from slpi_ros.diagnosis.prepare import drive_frequency, excited_frequency
 from slpi_ros.diagnosis.ruler import LEAST, independent_trials
 from slpi_ros.effects.base import Candidate, Effect, FitContext, is_course
@@ -23,8 +23,8 @@ from slpi_ros.identification.progress import report_progress
 MOST_EFFECTS, WIDTH, MOST_TRIED = 4, 3, 20
 # Places of sets of so many forms among those that are fitted in a round.
 PLACES = ((1, 4), (2, 2), (3, 1))
-# Gauss-Newton steps of a set, and of the best one.
-STEPS, CONVERGED = 5, 15
+# Gauss-Newton steps of a set; of the best one as many as it takes.
+STEPS, CONVERGED = 5, MOST_TURNS
 # Largest number of rounds, each with columns at new parameters.
 MOST_ROUNDS = 6
 # A round that lowers the mean square by less than this share is the last one.

@@ -127,7 +127,7 @@ class Row:
     @property
     def named(self) -> bool:
         """Whether exactly the hidden effects were found; delay and lag count as one."""
-        return _alike(self.hidden) == _alike(self.found)
+        return alike(self.hidden) == alike(self.found)
 
     @property
     def good(self) -> bool:
@@ -150,7 +150,8 @@ HEADER = (
 )
 
 
-def _alike(names: Sequence[str]) -> set[str]:
+def alike(names: Sequence[str]) -> set[str]:
+    """Return the names of effects, those that look alike from outside as one."""
     return {"delay or lag" if name in ALIKE else name for name in names}
 
 

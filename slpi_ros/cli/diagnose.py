@@ -30,7 +30,14 @@ def _run(options: Namespace) -> Result:
     from slpi_ros.io.bag_reader import require_different
     from slpi_ros.io.schemas import format_document
     from slpi_ros.model.document import load_model
-    from slpi_ros.reports.diagnosis import FILES, PAGE, describe_diagnosis, diagnosis_limits, write_files
+    from slpi_ros.reports.diagnosis import (
+        FILES,
+        PAGE,
+        describe_diagnosis,
+        diagnosis_good,
+        diagnosis_limits,
+        write_files,
+    )
     from slpi_ros.reports.text import verdict
     from slpi_ros.workflows.diagnose import DiagnoseRequest, diagnose
 
@@ -60,7 +67,7 @@ def _run(options: Namespace) -> Result:
         lines,
         format_document(diagnosis.to_document(), "diagnosis"),
         next_command,
-        verdict(limits),
+        verdict(limits, diagnosis_good(diagnosis)),
         [*warned, *described, page],
     )
 

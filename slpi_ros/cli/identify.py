@@ -37,7 +37,7 @@ def _run(options: Namespace) -> Result:
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.model.document import format_model, save_model
     from slpi_ros.model.sensor import Sensor
-    from slpi_ros.reports.text import describe_model, model_limits, verdict
+    from slpi_ros.reports.text import describe_model, model_good, model_limits, verdict
     from slpi_ros.workflows.identify import IdentifyRequest, identify
     from slpi_ros.workflows.records import UnusableRecordError
 
@@ -87,7 +87,7 @@ def _run(options: Namespace) -> Result:
         [*warned, *describe_model(model, details=False), *lines],
         format_model(model),
         next_command,
-        verdict(limits),
+        verdict(limits, model_good(model)),
         [*told, *lines, *describe_model(model)],
     )
 

@@ -181,8 +181,10 @@ class Axis:
         assert self.model
         moved = abs(voltage - self.stream.voltage) > self.amplifier.tolerance()
         if moved:
+            offset = self.loop.offsets.latest(now_ns)
+            measured = None if offset is None else self.expected + offset
             self.loop.leave(self.stream)
-            self.stream.rest_at(voltage)
+            self.stream.rest_at(voltage, measured)
             if self.confidence.state != RESETTING:
                 self.confidence = MemoryConfidence(
                     doubt=f"moved to {volts(voltage)} V by something else since its memory was known"

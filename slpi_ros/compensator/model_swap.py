@@ -135,7 +135,7 @@ class InitialState:
         for name, stream in streams.items():
             stream.coupled = present.coupled
             stream.surround(surroundings)
-            errors[name] = abs(measured - stream.rest_at(present.voltage))
+            errors[name] = abs(measured - stream.rest_at(present.voltage, measured))
         best = min(START_MEMORIES, key=lambda name: errors[name])
         self.assumed = None
         self._readings.clear()

@@ -120,9 +120,16 @@ class SensorRule(Rule):
         scatter, smooth = (float(np.std(np.diff(each, 2))) / BEND for each in (reading, expected))
         if scatter > limits.noisy * self.span + 2.0 * smooth:
             return "noisy", f"the reading scatters by {scatter * 1e9:.4g} nm rms"
-        if model < max(limits.moved * self.span, limits.moved_noises * self.noise):
+        least = max(limits.moved * self.span, limits.moved_noises * self.noise)
+        if model < least:
             return "", ""
         kind, slope = misfit(expected, reading, limits.following)
+        if kind == "inverted":
+            # Feedback answers a jump of the reading by moving against it, which looks like an inverted sensor.
+            at = int(np.argmax(np.abs(np.diff(reading)))) + 1
+            part = max((slice(at), slice(at, None)), key=lambda rows: float(np.ptp(expected[rows])))
+            if np.ptp(expected[part]) >= least:
+                kind, slope = misfit(expected[part], reading[part], limits.following)
         if kind == "inverted":
             return kind, f"the reading moves by {slope:.2g} m for each metre that the voltage moves; check its sign"
         moved = f"{np.ptp(reading) * 1e9:.3g} nm while the voltage moves it by {model * 1e9:.4g} nm"

@@ -34,15 +34,20 @@ class ZeroOffsets:
         self._recent.clear()
         self._sweep.clear()
 
+    def latest(self, now_ns: int) -> float | None:
+        """Return the offset (m) of the last 0.2 s; None without a measurement."""
+        recent = [offset for t, offset in self._recent if now_ns - t <= OFFSET_AGE_NS]
+        return median(recent) if recent else None
+
     def present(self, now_ns: int) -> float | None:
         """Return the present offset (m); None without a measurement in the last 0.2 s.
 
         Right after a reset it is that of its first swings down and up over the range, as the calibrator takes it from a
         sweep: what relaxes afterwards is not in it, and what differs between falling and rising voltages cancels.
         """
-        recent = [offset for t, offset in self._recent if now_ns - t <= OFFSET_AGE_NS]
-        if recent and self._sweep and now_ns - self._sweep[-1][0] <= SWEEP_AGE_NS:
+        recent = self.latest(now_ns)
+        if recent is not None and self._sweep and now_ns - self._sweep[-1][0] <= SWEEP_AGE_NS:
             swings = [[offset for _, swing, offset in self._sweep if swing == each] for each in (1, 2)]
             if all(swings):
                 return fmean(map(median, swings))
-        return median(recent) if recent else None
+        return recent

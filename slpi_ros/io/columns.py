@@ -86,6 +86,8 @@ _SPELLED = {
 Reader = Callable[[Sequence[str]], Mapping[str, FloatArray]]
 # Rows from which a line can be told from a loop; what is left beside a line is noise up to this multiple of its own.
 FEWEST_FOR_A_LINE, AS_NOISE = 20, 1.5
+# Median of the absolute value of a standard normal value.
+NORMAL_MEDIAN = 0.6745
 # Word by which the name of a column says that its displacement is a desired one.
 _DESIRED = re.compile(r"(?<![^\W\d_])(?:desired|set[ _-]?point)(?![^\W\d_])", re.IGNORECASE)
 # Names of columns of time: of LabVIEW, of MATLAB, and of a sampling period.
@@ -427,8 +429,15 @@ def is_line(x: FloatArray, y: FloatArray, fewest: int = FEWEST_FOR_A_LINE) -> bo
     rest = y - np.mean(x * y) * x
     steps = [np.diff(np.unique(signal)) for signal in (x, y)]
     digits = max(float(step.min()) for step in steps)
-    # A loop of hysteresis changes little from row to row; noise does, and digits are as large as they are.
-    return float(np.std(rest)) <= max(AS_NOISE * float(np.std(np.diff(rest))) / 2**0.5, digits)
+    # A loop of hysteresis changes little from row to row; noise does, and digits are as large as they are. What is
+    # hardly smaller than the signal is not beside a line.
+    left = float(np.std(rest))
+    return left <= max(AS_NOISE * _noise(rest), digits) and AS_NOISE * left < 1.0
+
+
+def _noise(x: FloatArray) -> float:
+    """Return the standard deviation of white noise with steps from row to row as large as the median of these."""
+    return float(np.median(np.abs(np.diff(x)))) / (NORMAL_MEDIAN * 2**0.5)
 
 
 def _missing(names: Sequence[str], source: str, quantity: ColumnQuantity, also: str = "") -> NoReturn:

@@ -22,6 +22,8 @@ StreamingEffects = dict[str, StreamingEffect]
 # A desired displacement outside the identified range by more than this share of its span is refused as an error (wrong
 # unit, another stage); one closer to the range is held at the voltage limit.
 TOLERATED_SHARE = 0.2
+# Steps to the displacement at which a stage has relaxed: the slow part is a small share of it.
+RELAXED_STEPS = 10
 # Tolerance for rounding errors, as a share of the displacement range, or of the voltage.
 ROUNDING = 1e-9
 
@@ -73,8 +75,12 @@ class StreamingInverse:
         # The axis may start outside its limits; the first output voltage is inside.
         self.rest_at(self.limits.clip(memory.voltage))
 
-    def rest_at(self, voltage: float) -> float:
-        """Continue from a voltage (V) at which the stage rests, all effects in equilibrium; return where it is (m)."""
+    def rest_at(self, voltage: float, measured: float | None = None) -> float:
+        """Continue from a voltage (V) at which the stage rests, all effects in equilibrium; return where it is (m).
+
+        Slow effects have relaxed where the stage is `measured` to be (m), whatever the memory says, but within the
+        largest loop.
+        """
         if voltage != self.pace.voltage:
             self.pace.start(voltage)
         self._command = felt = voltage
@@ -88,12 +94,32 @@ class StreamingInverse:
         if self._driven:
             for streaming in self._driven:
                 streaming.reach(self._applied)
-        y = self._inside
+        y = rested = self._inside
+        if measured is not None and any(streaming.relaxing for streaming in self._behind.values()):
+            rested = self._rested(felt, measured - self.coupled)
         for streaming in self._behind.values():
-            streaming.start(y)
+            streaming.start(rested if streaming.relaxing else y)
             y = streaming.forward(0.0, y)
         self.desired, self._missing, self._displacement = self._inside, 0.0, y
         return y + self.coupled
+
+    def _rested(self, felt: float, measured: float) -> float:
+        """Return the displacement (m) of the hysteresis, at the voltage it feels (V), of a stage that rests there."""
+        memory, state, ends = copy(self.memory), self.memory.snapshot(), list[float]()
+        for end in (self._v_min, self._v_max):
+            memory.restore(state)
+            memory.forward(end)
+            ends.append(memory.forward(felt))
+        beside = self._inside - self.memory.displacement
+        low, high = min(ends) + beside, max(ends) + beside
+        rested = min(max(measured, low), high)
+        for _ in range(RELAXED_STEPS):
+            y = rested
+            for streaming in self._behind.values():
+                streaming.start(y)
+                y = streaming.forward(0.0, y)
+            rested = min(max(rested + measured - y, low), high)
+        return rested
 
     @property
     def _streaming(self) -> "dict[str, StreamingEffect | StreamingAround]":

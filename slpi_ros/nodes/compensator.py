@@ -22,6 +22,7 @@ from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS, JointStates
 from slpi_ros.io.stage_name import acceptance
+from slpi_ros.model.document import load_model
 from slpi_ros.model.limits import volts
 from slpi_ros.nodes.common import (
     COMMANDS,
@@ -127,6 +128,9 @@ class Compensator(LifecycleNode):
         return self._parameter_set.settings
 
     def _check_settings(self, new: CompensatorSettings) -> None:
+        file = new.values["model_file"]
+        if file and file != self._settings.values["model_file"]:
+            load_model(file)
         for axis, limits in zip(self._controller.axes, new.limits, strict=True):
             axis.check_limits(limits)
         for axis, loop in zip(self._controller.axes, new.loops, strict=True):

@@ -186,7 +186,7 @@ def _assumed(axis: Axis) -> str:
     """Return a text that describes the assumed memory of an axis."""
     start = axis.initial.assumed
     if axis.confidence.doubt or not start:
-        return axis.confidence.doubt or "as before activation"
+        return axis.confidence.doubt or "has not been reset"
     where = {"end": "at the end of the record", "start": "at the start of the record", "wiped": "as after a reset"}
     text = f"starts {where[start]}, at {volts(axis.stream.voltage)} V (start_memory {start})"
     if start == "end" and axis.model and axis.model.end is None:

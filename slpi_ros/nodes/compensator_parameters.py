@@ -28,7 +28,8 @@ DECLARATIONS = (
     declare.AXES,
     declare.path(
         "model_file",
-        "Model document to load; empty: wait for stage_model. A change takes effect at the next configure.",
+        "Model document to load; empty: wait for stage_model. A change takes effect at the next configure; one that "
+        "cannot be read is refused.",
     ),
     declare.text(
         "hardware_id", "",

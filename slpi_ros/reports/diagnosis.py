@@ -25,7 +25,7 @@ from slpi_ros.model.document import format_model
 from slpi_ros.reports import views
 from slpi_ros.reports.chart import AFTER, BEFORE, CAUSES, DISPLACEMENT, ERROR, NOISE, Chart, Panel, Quantity
 from slpi_ros.reports.page import Page, Severity, Share
-from slpi_ros.reports.text import NO_DRIVE, above_noise, is_straight
+from slpi_ros.reports.text import NO_DRIVE, above_noise, how_good, is_without_hysteresis
 from slpi_ros.reports.views import Motion, Series
 
 # Relative difference of equal errors.
@@ -304,11 +304,17 @@ def diagnosis_limits(diagnosis: Diagnosis) -> dict[str, str]:
             causes.append("a cause that is none of the known effects")
         if not causes and above_noise(found.given_rms, found.noise_rms, high - low):
             causes.append("a model that does not fit the stage as it is now")
-        if not causes and is_straight(diagnosis.extended.axes[name]):
+        if not causes and is_without_hysteresis(diagnosis.extended.axes[name]):
             causes.append(NO_DRIVE)
         if causes:
             limits[name] = ", ".join(causes)
     return limits
+
+
+def diagnosis_good(diagnosis: Diagnosis) -> str:
+    """Return how good the given model is if nothing limits it."""
+    axes = ((found, diagnosis.extended.axes[name].displacement_range) for name, found in diagnosis.axes.items())
+    return how_good((found.given_rms, found.noise_rms, high - low) for found, (low, high) in axes)
 
 
 def describe_diagnosis(diagnosis: Diagnosis) -> list[str]:

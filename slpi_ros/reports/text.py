@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from slpi_ros.compensator.plausible import LONGEST, implausible_stroke
 from slpi_ros.errors import length
 from slpi_ros.hysteresis.kinds import DESCRIPTIONS, Hysteresis
 from slpi_ros.hysteresis.loop_family import LoopFamily
@@ -20,14 +21,15 @@ if TYPE_CHECKING:
 
 # Noise of a sensor, rms, as a share of the displacement range, beyond which it limits what a model can promise.
 NOISY = 0.005
-# What is said of a voltage of which the displacement is a straight line.
+# What is said of a voltage that the displacement follows on one curve.
 NO_DRIVE = (
-    "the voltage: the displacement is a straight line of it, without hysteresis, as of a monitor of the sensor; the "
-    "voltage must be that of the drive"
+    "the voltage: the displacement follows it without hysteresis, as a monitor of the sensor or the reference of a "
+    "servo does; the voltage must be that of the drive"
 )
+AT_NOISE = "at the sensor noise"
 
 
-def verdict(limits: Mapping[str, str], good: str = "at the sensor noise") -> str:
+def verdict(limits: Mapping[str, str], good: str = AT_NOISE) -> str:
     """Return the verdict on all axes in one line: what limits the accuracy of each axis of `limits`, else `good`."""
     if limits:
         return f"ERROR SOURCES: {'; '.join(f'axis {axis}: {limit}' for axis, limit in limits.items())}"
@@ -43,29 +45,48 @@ def above_noise(rms: float, noise: float, stroke: float) -> str:
     return f"an error of {length(rms)} rms, {times}"
 
 
+def how_good(errors: Iterable[tuple[float, float, float]]) -> str:
+    """Return how small errors (m rms), each with the noise (m rms) and the stroke (m), are that nothing limits."""
+    above = max((rms / stroke for rms, noise, stroke in errors if rms > ABOVE_NOISE * noise), default=0.0)
+    return f"an error of {above:.3%} of the range, below what a model of hysteresis resolves" if above else AT_NOISE
+
+
+def error_of(axis: AxisModel) -> tuple[float, float, float]:
+    """Return the error (m rms) of a model where it was not fitted, if known, the noise (m rms), and the stroke (m)."""
+    quality, (low, high) = axis.quality, axis.displacement_range
+    error = quality.held_out_rms if np.isfinite(quality.held_out_rms) else quality.rms
+    return error, quality.floor_rms, high - low
+
+
+def model_good(model: StageModel) -> str:
+    """Return how good a model is that nothing limits."""
+    return how_good(map(error_of, model.axes.values()))
+
+
 def model_limits(model: StageModel) -> dict[str, str]:
     """Return what limits the accuracy of each axis of a model; axes at the sensor noise are left out."""
     limits = {}
     for name, axis in model.axes.items():
         quality, (low, high) = axis.quality, axis.displacement_range
-        error = quality.held_out_rms if np.isfinite(quality.held_out_rms) else quality.rms
-        if limit := above_noise(error, quality.floor_rms, high - low):
+        if high - low > LONGEST:
+            limits[name] = f"the unit: {implausible_stroke(high - low)}, which no piezo stage has"
+        elif limit := above_noise(*error_of(axis)):
             limits[name] = f"{limit}, of unknown cause"
-        elif is_straight(axis):
+        elif is_without_hysteresis(axis):
             limits[name] = NO_DRIVE
         elif (share := quality.floor_rms / (high - low)) > NOISY:
             limits[name] = f"the sensor, whose noise of {length(quality.floor_rms)} rms is {share:.1%} of the range"
     return limits
 
 
-def is_straight(axis: AxisModel) -> bool:
-    """Return whether the largest loop of a model is a straight line but for noise."""
+def is_without_hysteresis(axis: AxisModel) -> bool:
+    """Return whether the largest loop of a model is one curve but for noise, or for what no model resolves."""
     if not axis.causal:
         return False
-    v, *branches = largest_loop(axis, *axis.hysteresis_range)
-    v, y = np.append(v, v), np.concatenate(branches)
-    bent = y - np.polyval(np.polyfit(v, y, 1), v)
-    return float(np.sqrt(np.mean(bent**2))) <= ABOVE_NOISE * axis.quality.floor_rms
+    _, rising, falling = largest_loop(axis, *axis.hysteresis_range)
+    low, high = axis.displacement_range
+    half = float(np.sqrt(np.mean((rising - falling) ** 2))) / 2.0
+    return half <= max(ABOVE_NOISE * axis.quality.floor_rms, RESOLUTION * (high - low))
 
 
 def change_limits(changes: Mapping[str, "AxisChange"], model: StageModel) -> dict[str, str]:

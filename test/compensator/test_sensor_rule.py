@@ -134,6 +134,18 @@ def test_feedback_on_a_sensor_that_lies_is_bounded_and_switched_off_feedforward_
     assert loop.axis.loop.state == "on" and len(loop.faults) == 1
 
 
+def test_a_reading_that_jumps_is_not_inverted():
+    """Feedback moves against the jump, which looked like a sensor of the wrong sign."""
+    rule = SensorRule(SPAN, NOISE)
+    rule.fault_time, noise = FAULT_TIME, np.random.default_rng(5)
+    for k in range(400):
+        t = 5e-3 * k
+        expected = 10e-6 - 1.5e-6 * min(max((t - 1.0) / 0.1, 0.0), 1.0)
+        jumped = 3e-6 if t >= 0.99 else 0.0
+        rule.read(expected, expected + jumped + noise.normal(0.0, NOISE), k * 5 * MS)
+        assert rule.check(k * 5 * MS) is None
+
+
 def test_a_correction_at_its_limit_is_saturated_and_no_fault():
     loop = Loop(offset=-8.0)
     loop.run(4.0)

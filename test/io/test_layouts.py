@@ -248,6 +248,24 @@ def test_a_monitor_of_the_sensor_is_told(tmp_path):
     assert any("'Monitor (V)'" in line and "monitor" in line for line in table.summary)
 
 
+@pytest.mark.parametrize("what", ["a loop", "a loop with a spike", "noise", "a line", "a noisy line"])
+def test_only_a_line_is_taken_for_a_monitor(tmp_path, what):
+    """One damaged reading of 4,000 made a loop a line; so did readings that are nothing but noise."""
+    rng = np.random.default_rng(3)
+    moved = np.array([y for _, _, y in ROWS])
+    moved = {
+        "a loop": moved,
+        "a loop with a spike": np.where(np.arange(N) == N // 2, 99.0, moved),
+        "noise": rng.normal(0.0, 1.0, N),
+        "a line": 0.1 * V,
+        "a noisy line": 0.1 * V + rng.normal(0.0, 8e-3, N),
+    }[what]
+    rows = [(t, v, y) for (t, v, _), y in zip(ROWS, moved.tolist(), strict=True)]
+    path = written(tmp_path, "Time (s),x_V,x_um\n" + lines(",", rows=rows, form="{:.6f}"))
+    summary = import_with_summary(path, ColumnOptions()).summary
+    assert any("monitor" in line for line in summary) == what.endswith("line")
+
+
 def test_the_scales_of_a_sensor_and_of_an_amplifier(tmp_path):
     rows = [(t, v / 10.0, y / 6.0) for t, v, y in ROWS]
     path = written(tmp_path, "Time (s),Drive (V),Sensor (V)\n" + lines(",", rows=rows, form="{!r}"))

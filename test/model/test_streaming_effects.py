@@ -97,6 +97,32 @@ def test_a_stage_that_is_found_at_rest_stays_where_it_is(effects, voltage):
         assert stream.drive(voltage, 0.01) == pytest.approx(there, abs=1e-12)
 
 
+@pytest.mark.parametrize("effects", [(CREEP,), (LAG, CREEP), EVERY], ids=ids)
+@pytest.mark.parametrize("off", [0.0, 1e-5])
+def test_slow_effects_have_relaxed_where_a_stage_is_measured(effects, off):
+    """With the wrong history its creep was off for minutes, also after a reset of the memory."""
+    axis = with_effects(*effects)
+    stage, model = axis.stream(), axis.stream()
+    for stream, before in ((stage, 100.0), (model, 5.0)):
+        stream.drive(before, 1.0)
+    stage.drive(40.0, 1.0)
+    for _ in range(5):
+        stage.wait(1e5)
+    there = stage.drive(40.0)
+    unaware = model.copy()
+    assert abs(unaware.rest_at(40.0) - there) > 0.05 * SPAN
+    # A reading that is off by more than the loop is wide is not believed.
+    model.rest_at(40.0, there + off)
+    assert model.voltage == 40.0
+    # A sweep wipes the memory, and leaves the rest of the relaxation.
+    ends = {}
+    for stream in (stage, model, unaware):
+        for v in np.interp(np.arange(61), [0, 10, 20, 40, 50, 60], [40.0, 110.0, 110.0, 0.0, 0.0, 40.0]).tolist():
+            ends[stream] = stream.drive(v, 0.01)
+    aware, wrong = (abs(ends[stream] - ends[stage]) for stream in (model, unaware))
+    assert aware < (0.1 if off == 0.0 else 2.0) * wrong
+
+
 @pytest.mark.parametrize("effects", SETS, ids=ids)
 def test_the_stream_knows_where_the_model_is(effects):
     """What it says of its own displacement is what the model makes of its voltages, limits or not."""

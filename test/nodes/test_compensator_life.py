@@ -84,6 +84,8 @@ def test_a_wrong_model_file_keeps_it_unconfigured_until_it_is_right(x_file, tmp_
         status, values = client.report(models_refused=1)
         assert status.level == b"\2" and "none.json: cannot read a model" in status.message
         assert state(client) == State.PRIMARY_STATE_UNCONFIGURED
+        missing = str(tmp_path / "missing.json")
+        assert "cannot read a model" in client.graph.set_parameters(client.name, model_file=missing)
         assert client.graph.set_parameters(client.name, model_file=x_file) == ""
         assert client.change_state(CONFIGURE) and client.change_state(ACTIVATE)
         client.connect()

@@ -130,7 +130,8 @@ class Row:
 
     def line(self) -> str:
         """Return the row of the table."""
-        after, zeros = ("".join(f" {each * 1e9:+8.1f}" for each in pair) for pair in (self.later, self.zeros))
+        after = "".join(f" {each * 1e9:8.1f}" for each in self.later)
+        zeros = "".join(f" {each * 1e9:+8.1f}" for each in self.zeros)
         return (
             f"{self.seed:4} {', '.join(self.hidden):32} {', '.join(self.found):32} {self.promised * 1e9:8.1f} "
             f"{self.zero * 1e9:+8.1f}{after}{zeros} {'yes' if self.kept else 'told' if self.told else 'NO':4} "

@@ -137,12 +137,11 @@ class RatePlays:
 class Preisach:
     """Classical Preisach model: density constant in each cell of the plane, and a reversible part.
 
-    The plane has finitely many relays, which is to its advantage: with ever more of them a twin leaves up to a fifth
-    more.
+    The plane has finitely many relays: a twin with a continuous one leaves up to a tenth more or less.
     """
 
     cells: int = 24
-    fine: int = 6
+    fine: int = 12
     name: str = "Preisach"
     free: int = 0
 

@@ -137,11 +137,11 @@ class RatePlays:
 class Preisach:
     """Classical Preisach model: density constant in each cell of the plane, and a reversible part.
 
-    The plane has finitely many relays: a twin with a continuous one leaves up to a tenth more or less.
+    The plane has so many relays that a twin with a continuous one leaves hardly more or less.
     """
 
     cells: int = 24
-    fine: int = 12
+    fine: int = 24
     name: str = "Preisach"
     free: int = 0
 

@@ -18,9 +18,6 @@ from pathlib import Path
 import numpy as np
 
 import slpi_ros
-from slpi_ros.effects.base import Effect
-from slpi_ros.effects.creep import Creep
-from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.io.record import Record
 from slpi_ros.io.tables import import_table
 from slpi_ros.model.axis_model import AxisModel, Start
@@ -53,24 +50,14 @@ def free_run(model: AxisModel, record: Record, axis: str, others: Collection[tup
     """
     v, y = record.voltage[axis], record.displacement[axis]
     known = np.isfinite(y)
-    # Creep and rate law that continue from before a record are specific to the record, like its initial state.
-    calm = replace(model, effects=tuple(settled(one) for one in model.effects))
+    # A record need not begin as those of the model did.
+    calm = replace(model, effects=tuple(one.rested for one in model.effects))
     errors = [
         replace(each, start=Start(float(v[0]), 0.0, history)).simulate(record.t, v)[known] - y[known]
         for history in {(), (float(v[0]),), model.start.history, *others}
         for each in (model, calm)
     ]
     return 100.0 * min(float(np.std(error)) for error in errors) / float(np.ptp(y[known]))
-
-
-def settled(effect: Effect) -> Effect:
-    """Return an effect without what continues from before the record that it was fitted to."""
-    match effect:
-        case Creep():
-            return replace(effect, initial=0.0)
-        case RateDependence():
-            return replace(effect, initial=())
-    return effect
 
 
 def splits(names: tuple[str, ...]) -> Iterator[tuple[str, ...]]:

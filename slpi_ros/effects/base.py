@@ -355,6 +355,11 @@ class EffectBase(Protocol):
         """The effect for another fit, without what it knows of the records of this one."""
         return self
 
+    @property
+    def rested(self) -> Self:
+        """The effect on a record before which the stage had rested."""
+        return self
+
     def of_record(self, k: int) -> "Effect":
         """Return the effect as it is on the record of number `k` of those that it was fitted to."""
         return self  # type: ignore[return-value]

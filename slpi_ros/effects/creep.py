@@ -252,6 +252,11 @@ class Creep(EffectBase):
         alike = bool(np.all(np.abs(moves - initial) <= BEGAN_ALIKE * abs(initial)))
         return replace(self, initial=initial) if alike else self
 
+    @property
+    def rested(self) -> "Creep":
+        """The creep without the move before the records."""
+        return replace(self, initial=0.0)
+
     def describe(self) -> str:
         """Describe the magnitude, and the time constants or the power of time."""
         if not isinf(self.exponent):

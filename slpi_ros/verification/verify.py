@@ -427,7 +427,10 @@ def _free_run(
 
 def _run(axis: AxisModel, t: FloatArray, samples: Samples, start_memory: StartMemory | None, since: float) -> _Run:
     """Simulate an axis on a record from its initial state; samples before `since` (s) are not judged."""
-    found, begins_known = _matched(axis, t, samples, start_memory)
+    # A record need not begin as those of the model did.
+    rested = replace(axis, effects=tuple(effect.rested for effect in axis.effects))
+    ways = (_matched(one, t, samples, start_memory) for one in ([axis] if rested == axis else [axis, rested]))
+    found, begins_known = min(ways, key=lambda way: _spread(way[0]))
     simulated = replace(found.axis, start=found.start).simulate(t, samples.v)
     # The outliers that `identify` leaves out are no error of the model.
     samples = samples.without_outliers(simulated)

@@ -15,6 +15,7 @@ import slpi_ros.io.bag_writer
 from slpi_ros.cli import main
 from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.contact import Contact
+from slpi_ros.effects.creep import Creep
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.io.schemas import validate
@@ -263,6 +264,18 @@ def test_what_does_not_go_together_is_refused(model):
             slpi_ros.verify(unseen(), model, tolerance)
     with pytest.raises(RecordError):
         slpi_ros.verify(unseen(), model, desired=[{"x": np.full(len(unseen()), np.nan)}])
+
+
+@pytest.mark.parametrize("moved", [0.0, 3e-6])
+def test_a_record_need_not_begin_as_those_of_the_model(moved, model):
+    creep = Creep((10.0,), (0.1,), initial=3e-6)
+    creeping = replace(model, axes={"x": replace(model.axes["x"], effects=(creep,))})
+    record = unseen((100, 20, 80))
+    y = replace(creep, initial=moved).apply(record.displacement["x"], EffectContext.since_start(record.t))
+    one, plain = judged(replace(record, displacement={"x": y}), creeping), judged(record, model)
+    assert one.passed
+    assert one.share == plain.share
+    assert one.rest.rms < 1.1 * plain.rest.rms
 
 
 def path(model):

@@ -7,7 +7,6 @@ import numpy as np
 
 import slpi_ros
 from benchmarks.measured.methods.base import FloatArray, Series
-from benchmarks.records import settled
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import AxisModel
@@ -22,7 +21,6 @@ class SlpiModel:
     """An identified model, and what was found."""
 
     model: AxisModel
-    fitted: frozenset[str]
     first: str
     said: str
 
@@ -44,9 +42,6 @@ class SlpiModel:
     def _from(self, name: str, v: float, history: tuple[float, ...]) -> AxisModel:
         """Return the model at the start of a record that begins at `v` (V)."""
         model = self.model
-        if name not in self.fitted:
-            # Creep and rate law that continue from before a record belong to that record.
-            model = replace(model, effects=tuple(settled(effect) for effect in model.effects))
         if name == self.first and not history:
             # The state that the identification found for this record.
             return model
@@ -83,8 +78,7 @@ class SlpiMethod:
                 model, found = diagnosis.extended, diagnosis.axes[AXIS]
                 kept = ", ".join(effect.name for effect in model.axes[AXIS].effects)
                 said = f"{found.verdict}; in the model: {kept or 'nothing'}"
-        names = frozenset(one.name for one in records)
-        return SlpiModel(model.axes[AXIS], names, records[0].name, said)
+        return SlpiModel(model.axes[AXIS], records[0].name, said)
 
 
 SLPI = SlpiMethod("SLPI", causes=False)

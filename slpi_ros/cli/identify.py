@@ -37,7 +37,7 @@ def _run(options: Namespace) -> Result:
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.model.document import format_model, save_model
     from slpi_ros.model.sensor import Sensor
-    from slpi_ros.reports.text import describe_model, model_good, model_limits, verdict
+    from slpi_ros.reports.text import describe_model, model_good, model_limits, unexplained, verdict
     from slpi_ros.workflows.identify import IdentifyRequest, identify
     from slpi_ros.workflows.records import UnusableRecordError
 
@@ -70,7 +70,7 @@ def _run(options: Namespace) -> Result:
     options.remarks += [f"{one}; `slpi diagnose` looks for other causes" for one in done.unmoved]
     warned = [line for one in found for line in finding_lines(one, all_levels=False)]
     told = [line for one in found for line in finding_lines(one)]
-    if limits:
+    if any(map(unexplained, limits.values())):
         next_command = command_line(
             "slpi",
             "diagnose",
@@ -81,6 +81,8 @@ def _run(options: Namespace) -> Result:
             "diagnosis",
             *common.same_record(options),
         )
+    elif limits:
+        next_command = command_line("slpi", "doctor", *options.bags)
     else:
         next_command = f"slpi verify OTHER_BAG --model {shlex.quote(options.output)}"
     return Result(

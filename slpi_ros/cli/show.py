@@ -12,7 +12,7 @@ def _add_options(command: ArgumentParser) -> None:
 
 def _run(options: Namespace) -> Result:
     from slpi_ros.model.document import format_model, load_model
-    from slpi_ros.reports.text import describe_model, model_good, model_limits, verdict
+    from slpi_ros.reports.text import describe_model, model_good, model_limits, unexplained, verdict
     from slpi_ros.reports.uncertainty import describe_uncertainty
 
     model = load_model(options.model)
@@ -22,10 +22,14 @@ def _run(options: Namespace) -> Result:
         axes = model.axes.items()
         return [f"axis {name}: {line}" for name, axis in axes for line in describe_uncertainty(axis, details=details)]
 
+    if any(map(unexplained, limits.values())):
+        next_command = f"slpi diagnose BAG... --model {own} -o diagnosis"
+    else:
+        next_command = "slpi doctor BAG..." if limits else f"slpi verify OTHER_BAG --model {own}"
     return Result(
         [*describe_model(model, details=False), *uncertain(details=False)],
         format_model(model),
-        f"slpi diagnose BAG... --model {own} -o diagnosis" if limits else f"slpi verify OTHER_BAG --model {own}",
+        next_command,
         verdict(limits, model_good(model)),
         [*describe_model(model), *uncertain(details=True)],
     )

@@ -16,7 +16,7 @@ from slpi_ros.identification.record_quality import assess, findings
 from slpi_ros.io.record import Record
 from slpi_ros.io.stage_name import same_stage, stage_name
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.reports.text import error_of, how_good, model_limits
+from slpi_ros.reports.text import error_of, how_good, model_limits, unexplained
 
 Range = tuple[float, float]
 
@@ -102,7 +102,8 @@ def check_model(model: StageModel, limits: Range | None = None) -> list[Check]:
     limited = model_limits(model)
     for name, axis in model.axes.items():
         if name in limited:
-            checks.append(Check(FAILED, f"model: axis {name}: {limited[name]}; find it with 'slpi diagnose'"))
+            advice = "; find it with 'slpi diagnose'" if unexplained(limited[name]) else ""
+            checks.append(Check(FAILED, f"model: axis {name}: {limited[name]}{advice}"))
         else:
             checks.append(Check(OK, f"model: axis {name}: its error is {how_good([error_of(axis)])}"))
         if axis.end is None:

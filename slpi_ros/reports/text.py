@@ -27,6 +27,7 @@ NO_DRIVE = (
     "servo does; the voltage must be that of the drive"
 )
 AT_NOISE = "at the sensor noise"
+UNKNOWN = "of unknown cause"
 
 
 def verdict(limits: Mapping[str, str], good: str = AT_NOISE) -> str:
@@ -71,12 +72,17 @@ def model_limits(model: StageModel) -> dict[str, str]:
         if high - low > LONGEST:
             limits[name] = f"the unit: {implausible_stroke(high - low)}, which no piezo stage has"
         elif limit := above_noise(*error_of(axis)):
-            limits[name] = f"{limit}, of unknown cause"
+            limits[name] = f"{limit}, {UNKNOWN}"
         elif is_without_hysteresis(axis):
             limits[name] = NO_DRIVE
         elif (share := quality.floor_rms / (high - low)) > NOISY:
             limits[name] = f"the sensor, whose noise of {length(quality.floor_rms)} rms is {share:.1%} of the range"
     return limits
+
+
+def unexplained(limit: str) -> bool:
+    """Return whether a diagnosis may explain what limits an axis; else its record is to be mended."""
+    return limit.endswith(UNKNOWN)
 
 
 def is_without_hysteresis(axis: AxisModel) -> bool:

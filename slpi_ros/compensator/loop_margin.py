@@ -200,10 +200,10 @@ def refusal(model: AxisModel, gains: PidGains, period: float) -> str:
     do = loop.scaled(share).gains
     each = {"kp": do.proportional, "ki": do.integral, "kd": do.derivative}
     would = ", ".join(f"{name} {_rounded_down(value):g}" for name, value in each.items() if value) or "no gain"
-    state = f"hardly stable (modulus margin {found.modulus:.2g}, wanted {LEAST_MARGIN:g})"
+    state = f"barely stable (modulus margin {found.modulus:.2g}, wanted {LEAST_MARGIN:g})"
     return (
         f"with these gains the loop of the model is {state if found.stable else 'unstable'} near "
-        f"{found.frequency:.3g} Hz; {would} would do; force_gains takes them all the same"
+        f"{found.frequency:.3g} Hz; {would} would do; force_gains accepts them nevertheless"
     )
 
 

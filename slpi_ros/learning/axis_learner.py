@@ -56,10 +56,10 @@ SETTLING = 3
 # The best path once more has not settled as long as a pass has less than this share of the mean square error of the one
 # before; most passes that are waited for.
 FALLING, MOST_SETTLING = 0.85, 6
-# Passes after the best one in which what is calculated to be transient excuses a larger error.
-EXCUSED = 4
-# Share of a larger error that the answer to what was changed has at least, if it is to be blamed.
-BLAMED = 0.5
+# Passes after the best one in which a calculated transient may explain a larger error.
+TRANSIENT = 4
+# Least share of a larger error that the response to a change explains, if the change is its cause.
+CAUSES = 0.5
 
 
 @dataclass(frozen=True)
@@ -287,7 +287,7 @@ class AxisLearner:
             self.record = min(self.record, power)
             self.best = _Best(number, power, self.correction, clean)
             return True
-        least = min(steady, rms**2) if number - best.number <= EXCUSED else rms**2
+        least = min(steady, rms**2) if number - best.number <= TRANSIENT else rms**2
         harmful = rms**2 > self._harm + self._scatter()
         if not harmful and least <= self._much_worse(best.power, unsure):
             return True
@@ -333,7 +333,7 @@ class AxisLearner:
         assert self.best is not None
         change = np.abs(self.spectrum.of(self.correction - self.best.correction))
         largest = np.abs(self.harmonics.gain) + np.sqrt(self.harmonics.gain_variance)
-        return math.sqrt(self.spectrum.power((largest * change) ** 2)) > BLAMED * more
+        return math.sqrt(self.spectrum.power((largest * change) ** 2)) > CAUSES * more
 
     def _much_worse(self, power: float, unsure: float) -> float:
         """Return the mean square error (m^2) from which on a pass is worse than one with an error of `power` (m^2)."""

@@ -31,8 +31,9 @@ SCATTER_SHARE = 0.3
 # Share that is left after another pass of a gain's variance by what was not foretold, and where nothing has tested it;
 # share of what the changes of one harmonic alone say of its gain.
 FORGOTTEN, KEPT, OWN_KEPT = 0.4, 0.9, 0.9
-# Standard deviations by which what is read of the path itself is not explained, until its gain is not known.
-RIDDLE = 8.0
+# Standard deviations by which a reading of the path itself may differ from its prediction; beyond, its gain is taken
+# as unknown.
+UNEXPLAINED = 8.0
 # Most of that variance, as a multiple of that of the first guess.
 MOST_MISFIT = 4.0
 # A share of the noise's new estimate in each pass, of one harmonic and (by this number of harmonics) of the floor.
@@ -175,7 +176,7 @@ class Harmonics:
         """
         noise, squares = self.noise + answer.transient_variance, around(np.abs(path) ** 2)
         apart = around(np.abs(reading - answer.gain * path) ** 2)
-        apart = apart - RIDDLE**2 * (rest + noise + answer.variance * squares)
+        apart = apart - UNEXPLAINED**2 * (rest + noise + answer.variance * squares)
         power = np.abs(answer.gain) ** 2
         told = np.maximum(apart, 0.0) / np.maximum(squares + rest / np.maximum(power, LEAST_GAIN**2), 1e-300)
         misfit = np.minimum(told, MOST_MISFIT * self.guessed)

@@ -165,7 +165,7 @@ DECLARATIONS = (
     ),
     Declaration(
         "force_gains", False,
-        "Whether gains are taken with which the loop of the model is unstable or hardly stable (modulus margin below "
+        "Whether gains are taken with which the loop of the model is unstable or barely stable (modulus margin below "
         "0.3); else feedback stays off with them.",
     ),
     declare.each_axis(

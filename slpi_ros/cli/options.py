@@ -32,7 +32,7 @@ def add_accept_stage(command: ArgumentParser) -> None:
     """Add ``--accept-stage``."""
     command.add_argument(
         "--accept-stage", metavar="NAME",
-        help="accept the stage of this name as that of the model and of the other records; default: refuse other stages",
+        help="accept the stage of this name as that of the model and the other records; default: refuse other stages",
     )  # fmt: skip
 
 

@@ -162,7 +162,7 @@ def test_a_refusal_says_in_one_line_which_gain_would_do():
     assert refusal(MODEL, PidGains(0.0, 3000.0 / slope), 1e-4) == ""
     near = DiscreteLoop(Plant.of(MODEL), PidGains(0.0, 1.6 / T / slope), T).margins
     assert near.stable and not near.enough
-    assert "hardly stable" in refusal(MODEL, PidGains(0.0, 1.6 / T / slope), T)
+    assert "barely stable" in refusal(MODEL, PidGains(0.0, 1.6 / T / slope), T)
 
 
 def test_a_long_delay_at_a_high_rate_is_judged_too():

@@ -1,24 +1,13 @@
 """Free parameters of effects as vectors, with their bounds, step sizes and uncertainties."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import exp, log
-from typing import ClassVar
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import (
-    Candidate,
-    Effect,
-    EffectBase,
-    EffectContext,
-    FitContext,
-    ResidualContext,
-    Side,
-    Signal,
-    usual_step,
-)
+from slpi_ros.effects.base import Candidate, Effect, EffectContext, FitContext, usual_step
 from slpi_ros.effects.parameters import Fit, Leaf, Scales
 
 # Largest change of a parameter in one step, relative to its magnitude, and of the logarithm of one that ranges over
@@ -27,25 +16,19 @@ LARGEST_STEP, LARGEST_LOG_STEP = 0.7, 2.0
 
 
 @dataclass(frozen=True)
-class EachRecord(EffectBase):
+class EachRecord(Effect):
     """An effect with separate parameters in each record, such as drift or lines: its `parts`."""
 
     parts: tuple[Effect, ...]
-    side: ClassVar[Side] = "record"
-    acts_on: ClassVar[Signal] = "displacement"
+    side = "record"
 
     def __post_init__(self) -> None:
         """Do nothing: each part has been validated."""
 
     @property
-    def name(self) -> str:
+    def name(self) -> str:  # type: ignore[override]
         """The effect's name."""
         return self.parts[0].name
-
-    @property
-    def uncertainty(self) -> Mapping[str, float]:
-        """Standard deviations of the parameters in the first record, by name."""
-        return self.parts[0].uncertainty
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the output for the concatenated signals of all records, shape (N,), metres."""
@@ -93,7 +76,7 @@ class EachRecord(EffectBase):
         return "; ".join(f"record {k}: {part.describe()}" for k, part in enumerate(self.parts, 1))
 
     @classmethod
-    def fit(cls, left: ResidualContext) -> Iterator[Candidate | Effect]:
+    def fit(cls, left: FitContext) -> Iterator[Candidate | Effect]:
         """Yield nothing: candidates come from the effect of each record."""
         yield from ()
 
@@ -159,4 +142,4 @@ def certain(effect: Effect, spread: Sequence[float]) -> Effect:
         place: min(deviation * (value if fit.kind == "logarithmic" else 1.0), LEAST_KNOWN)
         for (place, fit, value), deviation in zip(_fitted(effect), spread, strict=True)
     }
-    return replace(effect, uncertainty=found)  # type: ignore[type-var]
+    return replace(effect, uncertainty=found)

@@ -9,7 +9,7 @@ other records, and only offset and initial relaxation are estimated from the hel
 """
 
 import operator
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import pairwise
@@ -435,11 +435,6 @@ class JointFit:
         return self.evidence.used
 
     @property
-    def others(self) -> Mapping[str, FloatArray]:
-        """Displacement of the other axes relative to their start, shape (N,), metres."""
-        return self.evidence.others
-
-    @property
     def target(self) -> FloatArray:
         """Measured displacement minus the contribution of the effects, shape (N,), metres."""
         return self.evidence.y - self.added
@@ -453,12 +448,6 @@ class JointFit:
     def residual(self) -> FloatArray:
         """Residual, measured - predicted, shape (N,), metres."""
         return self.evidence.y - self.predicted
-
-    def of_record(self, k: int) -> "RecordResidual":
-        """Return the signals and the residual of record `k`."""
-        rows, around = self.evidence.slices[k], self.around.records[k]
-        t, u, h, y, residual = (x[rows] for x in (self.t, self.u, self.h, self.y, self.residual))
-        return RecordResidual(t, u, h, y, self.used[rows], residual, around)
 
     def respond(self, u: FloatArray) -> FloatArray:
         """Return the displacement of the hysteresis, shape (N,), metres, for another voltage `u`, shape (N,), volts."""
@@ -640,28 +629,6 @@ class JointFit:
         """Return the fit with additional `columns`, shape (N, k), metres, whose gains are free."""
         evidence = replace(self.evidence, beside=np.column_stack([self.evidence.beside, columns]))
         return JointFit(evidence, self.effects, self)
-
-
-@dataclass(frozen=True)
-class RecordResidual:
-    """Signals and residual of one record as a `slpi_ros.effects.base.ResidualContext`."""
-
-    t: FloatArray
-    u: FloatArray
-    h: FloatArray
-    y: FloatArray
-    used: Mask
-    residual: FloatArray
-    around: EffectContext
-
-    @property
-    def others(self) -> Mapping[str, FloatArray]:
-        """Displacement of the other axes relative to their start, shape (N,), metres."""
-        return self.around.others
-
-    def respond(self, u: FloatArray) -> FloatArray:
-        """Raise NotImplementedError: effects of a single record do not act on the voltage."""
-        raise NotImplementedError
 
 
 def _behind(effects: Sequence[Effect], h: FloatArray, around: EffectContext) -> FloatArray:

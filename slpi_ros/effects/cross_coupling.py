@@ -1,14 +1,13 @@
 """Cross coupling: displacement of an axis caused by the motion of other axes."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import Additive, Candidate, EffectContext, ResidualContext, Side, Signal
+from slpi_ros.effects.base import Additive, Candidate, EffectContext, FitContext
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining
 from slpi_ros.effects.parameters import Fit, parameter, require
 
@@ -27,12 +26,11 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 class CrossCoupling(Additive):
     """Linear coupling, ``y = x + sum_j gain_j m_j``, with ``m_j`` the motion of axis j; the stage model inverts it."""
 
-    name: ClassVar[str] = "cross_coupling"
-    acts_on: ClassVar[Signal] = "displacement"
-    side: ClassVar[Side] = "stage"
-    what: ClassVar[str] = "part of the movement of another axis"
-    compensated: ClassVar[str] = "if both axes are in one node"
-    excitation: ClassVar[Excitation] = Excitation(
+    name = "cross_coupling"
+    side = "stage"
+    what = "part of the movement of another axis"
+    compensated = "if both axes are in one node"
+    excitation = Excitation(
         "One axis moves while all others rest: what a resting axis shows then is coupling, and neither its own "
         "hysteresis nor its own dynamics.",
         _draw,
@@ -43,7 +41,6 @@ class CrossCoupling(Additive):
         "", "metres for one metre of another axis, by its name", -1, 1, count=(1, 100),
         fit=Fit("linear", 1e-5, most=0.4),
     )  # fmt: skip
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -56,10 +53,10 @@ class CrossCoupling(Additive):
         return sum(known, np.zeros_like(around.t))
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield a candidate with the motion of all other axes."""
-        if context.others:
-            yield Candidate(np.column_stack(list(context.others.values())), partial(cls._of, tuple(context.others)))
+        if others := context.around.others:
+            yield Candidate(np.column_stack(list(others.values())), partial(cls._of, tuple(others)))
 
     @classmethod
     def _of(cls, axes: tuple[str, ...], gains: FloatArray) -> "CrossCoupling":

@@ -1,26 +1,15 @@
 """Self-heating: the sensitivity of the stage follows the mean square rate of its voltage, as dissipated power."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from math import expm1, inf
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import (
-    Candidate,
-    EffectBase,
-    EffectContext,
-    FitContext,
-    ResidualContext,
-    Side,
-    Signal,
-    StreamingBase,
-    decays,
-    longest,
-)
+from slpi_ros.effects.base import Candidate, Effect, EffectContext, FitContext, StreamingEffect, decays, longest
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter
 
@@ -56,7 +45,7 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 
 @dataclass(frozen=True)
-class SelfHeating(EffectBase):
+class SelfHeating(Effect):
     """A factor on the displacement, ``y = x0 + (1 + gain P) (x - x0)``, ``time_constant dP/dt = (dv/dt)^2 - P``.
 
     ``P`` is the mean square rate of the voltage ``v`` at the piezo, 0 at first: a stage at rest is cold.
@@ -64,14 +53,13 @@ class SelfHeating(EffectBase):
 
     # At each sample the rate up to the one before counts, so that the inverse needs no voltage that it is to return. A
     # change of the voltage in no time has no rate. The factor never changes by more than `MOST`.
-    name: ClassVar[str] = "self_heating"
-    acts_on: ClassVar[Signal] = "displacement"
-    side: ClassVar[Side] = "stage"
-    what: ClassVar[str] = "the sensitivity follows how fast the voltage moves, within seconds to minutes"
-    compensated: ClassVar[str] = "yes, from a cold start"
-    needs_voltage: ClassVar[bool] = True
-    changes_gain: ClassVar[bool] = True
-    excitation: ClassVar[Excitation] = Excitation(
+    name = "self_heating"
+    side = "stage"
+    what = "the sensitivity follows how fast the voltage moves, within seconds to minutes"
+    compensated = "yes, from a cold start"
+    needs_voltage = True
+    changes_gain = True
+    excitation = Excitation(
         "Bursts of fast full loops, each followed by a hold at the top and slow loops: what warms the stage comes and "
         "goes with its own motion, where a drift of zero or sensitivity goes on by itself.",
         _draw,
@@ -96,7 +84,6 @@ class SelfHeating(EffectBase):
         "V^2/s^2", "mean square rate of the voltage at the start of each record, 0: cold", 0, 1e18, default=(),
         count=(0, 1000), fit=Fit("relative", least=0.0, start=True),
     )  # fmt: skip
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def limited(cls, changed: dict[str, Any]) -> dict[str, Any]:
@@ -122,7 +109,7 @@ class SelfHeating(EffectBase):
         """Return whether the change is small, comes and goes, and has an origin near the measured displacements."""
         near = context.near_motion(self.origin)
         # The voltage that the hysteresis feels is at most as fast as that at the piezo.
-        around = EffectContext(context.t, records=context.records, voltage=context.u)
+        around = context.around.driven(context.u)
         rates = _mean_square_rates(self.time_constant, around)
         largest = float(rates.max())
         fall = max(float(np.max(np.maximum.accumulate(own) - own)) for own in around.split(rates))
@@ -142,7 +129,7 @@ class SelfHeating(EffectBase):
         return self.origin + (signal - self.origin) / self.factor(around)
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield time constants up to a multiple of the longest record, for cold stages and for warm ones."""
         # A shift in proportion to each change of the sensitivity is fitted with it; their ratio gives the origin.
         slowest, (low, high) = LONGEST * longest(context.around), (float(context.h.min()), float(context.h.max()))
@@ -188,7 +175,7 @@ class SelfHeating(EffectBase):
         return StreamingSelfHeating(self)
 
 
-class StreamingSelfHeating(StreamingBase):
+class StreamingSelfHeating(StreamingEffect):
     """Streaming (sample by sample) self-heating; its state is the mean square rate and the last voltage (V)."""
 
     def __init__(self, effect: SelfHeating) -> None:

@@ -1,25 +1,22 @@
 """Surroundings: the stage follows quantities that were recorded beside it, such as temperature, load or humidity."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from math import exp, isfinite
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.effects.base import (
     Candidate,
-    EffectBase,
+    Effect,
     EffectContext,
     FitContext,
     Followed,
     FollowedGain,
-    ResidualContext,
-    Side,
-    Signal,
-    StreamingBase,
+    StreamingEffect,
     Unsure,
     decays,
     longest,
@@ -92,21 +89,20 @@ class Quantity:
 
 
 @dataclass(frozen=True)
-class Surroundings(EffectBase):
+class Surroundings(Effect):
     """Zero and sensitivity that follow quantities, ``y = x0 + (1 + sum_k s_k w_k) (x - x0) + sum_k o_k w_k``.
 
     ``w_k`` is the deviation of a quantity from its reference, or that after a first-order lag; ``o_k`` and ``s_k`` are
     `offset_gain` and `sensitivity_gain`, and ``x0`` is `origin`.
     """
 
-    name: ClassVar[str] = "surroundings"
-    acts_on: ClassVar[Signal] = "displacement"
-    side: ClassVar[Side] = "stage"
-    what: ClassVar[str] = "zero or sensitivity follow a recorded quantity (temperature, load, humidity, pressure)"
-    compensated: ClassVar[str] = "yes, if the quantity is measured in use"
-    changes_gain: ClassVar[bool] = True
-    follows_quantities: ClassVar[bool] = True
-    excitation: ClassVar[Excitation] = Excitation(
+    name = "surroundings"
+    side = "stage"
+    what = "zero or sensitivity follow a recorded quantity (temperature, load, humidity, pressure)"
+    compensated = "yes, if the quantity is measured in use"
+    changes_gain = True
+    follows_quantities = True
+    excitation = Excitation(
         "Full loops one after the other while one quantity alone is changed on purpose, up and down several times and "
         "each time for another while (heat on and off, load on and off): what comes and goes with it is its doing, "
         "and no drift does that.",
@@ -122,7 +118,6 @@ class Surroundings(EffectBase):
         "m", "what is left of before the start of each record, quantity by quantity with a time constant", -1e3, 1e3,
         default=(), count=(0, 4000),
     )  # fmt: skip
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -231,7 +226,7 @@ class Surroundings(EffectBase):
         return sum((amplitude * column for amplitude, column in pairs), np.zeros_like(around.t))
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield for each quantity offset, sensitivity and both, at once and with time constants."""
         around, low = context.around, float(context.h.min())
         slowest = LONGEST * longest(around)
@@ -284,7 +279,7 @@ class Surroundings(EffectBase):
         return StreamingSurroundings(self)
 
 
-class StreamingSurroundings(StreamingBase):
+class StreamingSurroundings(StreamingEffect):
     """Streaming (sample by sample) surroundings: each quantity holds its last value, at first the reference.
 
     Of noisy or late readings it is what their filter gives.

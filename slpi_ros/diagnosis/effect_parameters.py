@@ -25,6 +25,12 @@ class EachRecord(Effect):
     def __post_init__(self) -> None:
         """Do nothing: each part has been validated."""
 
+    @classmethod
+    def of(cls, parts: Sequence[Effect | None]) -> "EachRecord | None":
+        """Return the effect of these parts; None if one is missing."""
+        found = tuple(part for part in parts if part is not None)
+        return cls(found) if len(found) == len(parts) else None
+
     @property
     def name(self) -> str:  # type: ignore[override]
         """The effect's name."""
@@ -32,19 +38,17 @@ class EachRecord(Effect):
 
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the output for the concatenated signals of all records, shape (N,), metres."""
-        records = zip(self.parts, around.split(signal), around.records, strict=True)
-        return np.concatenate([part.apply(own, record) for part, own, record in records])
+        parts = iter(self.parts)
+        return around.each(lambda own, record: next(parts).apply(own, record), signal)
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the input signal, shape (N,), metres, for an output signal of all records."""
-        records = zip(self.parts, around.split(signal), around.records, strict=True)
-        return np.concatenate([part.invert(own, record) for part, own, record in records])
+        parts = iter(self.parts)
+        return around.each(lambda own, record: next(parts).invert(own, record), signal)
 
     def joined(self, other: "EachRecord") -> "EachRecord | None":
         """Return the effects of both, record by record."""
-        parts = [one.joined(two) for one, two in zip(self.parts, other.parts, strict=True)]
-        found = tuple(part for part in parts if part is not None)
-        return EachRecord(found) if len(found) == len(parts) else None
+        return EachRecord.of([one.joined(two) for one, two in zip(self.parts, other.parts, strict=True)])
 
     @property
     def courses(self) -> tuple[tuple[float, ...], ...]:
@@ -58,9 +62,7 @@ class EachRecord(Effect):
 
     def only_plausible(self, view: FitContext) -> "EachRecord | None":
         """Return the effect of each record without those of its parts that are not plausible."""
-        parts = [part.only_plausible(view.of_record(k)) for k, part in enumerate(self.parts)]
-        found = tuple(part for part in parts if part is not None)
-        return EachRecord(found) if len(found) == len(parts) else None
+        return EachRecord.of([part.only_plausible(view.of_record(k)) for k, part in enumerate(self.parts)])
 
     def free_leaves(self) -> list[Leaf]:
         """Return the fitted numbers of all records."""

@@ -241,24 +241,12 @@ class Columns:
         """Fit hysteresis and columns to all samples of `y` (m, (N,)); return parameters (p,) and gains (k,)."""
         # The parameters are in units of the problem's scale, without the constraint of monotone branches.
         own = self.equations.columns(y)
-        solved = np.column_stack([own.solved, self.solved])
-        cross = self.at.T @ own.at
-        products = np.block([[own.at.T @ own.at, cross.T], [cross, self._products]])
-        gains = _gains(np.column_stack([own.whole, self.whole]), products, solved)
-        return solved @ _missed(gains), gains
-
-
-def _missed(gains: FloatArray) -> FloatArray:
-    """Return the weights ``[1, -gains]``, shape (1 + k,), with which target and columns add up to the residual."""
-    return np.concatenate([[1.0], -gains])
-
-
-def _gains(projected: FloatArray, products: FloatArray, parameters: FloatArray) -> FloatArray:
-    """Return the gains, shape (k,), of the columns in a joint fit with the hysteresis to the first column."""
-    # `projected` is ``A'J``, `parameters` of the hysteresis are those of the best fit to each column, shape (p, 1 + k)
-    # each, and `products` is ``J'J``, shape (1 + k, 1 + k).
-    left = products[1:] - projected[:, 1:].T @ parameters
-    return solved(left[:, 1:], left[:, 0])
+        # Products with the design matrix, and the best hysteresis, of target and columns, shape (p, 1 + k) each.
+        projected = np.column_stack([own.whole, self.whole])
+        parameters = np.column_stack([own.solved, self.solved])
+        left = np.column_stack([self.at.T @ own.at, self._products]) - projected[:, 1:].T @ parameters
+        gains = solved(left[:, 1:], left[:, 0])
+        return parameters @ np.concatenate([[1.0], -gains]), gains
 
 
 def _solved(factor: Factor, of: FloatArray) -> FloatArray:
@@ -554,22 +542,14 @@ class JointFit:
         """Return the effects with the standard deviations of their free parameters."""
         if not self.effects:
             return []
-        spread = self._deviations(self.tangents).tolist()
-        effects = []
-        for effect in self.effects:
-            effects.append(certain(effect, [spread.pop(0) for _ in free(effect)]))
-        return effects
-
-    def _deviations(self, columns: FloatArray) -> FloatArray:
-        """Return the standard deviations, shape (k,), of the gains of columns, shape (N, k), metres."""
         # Errors of neighbouring samples are correlated, so there are fewer independent errors than samples.
-        precision = self.equations.columns(columns, self.before).precision
+        precision = self.equations.columns(self.tangents, self.before).precision
         errors = self.residual[self.evidence.used]
         size = np.sqrt(np.maximum(np.diag(precision), 1e-300))
         inverse = np.linalg.pinv(precision / np.outer(size, size), rcond=1e-12) / np.outer(size, size)
-        variances = np.maximum(np.diag(inverse)[: columns.shape[1]], 0.0)
-        deviations: FloatArray = np.sqrt(variances * np.mean(errors**2) * alike_in_a_row(errors))
-        return deviations
+        variances = np.maximum(np.diag(inverse), 0.0) * np.mean(errors**2) * alike_in_a_row(errors)
+        spread = iter(np.sqrt(variances).tolist())
+        return [certain(effect, [next(spread) for _ in free(effect)]) for effect in self.effects]
 
     def smoothed(self) -> "JointFit":
         """Return the fit with the smoothness of the hysteresis reselected by cross-validation, given the effects."""

@@ -237,7 +237,8 @@ def evidence_of(
         )
         for record, (t, samples, others), beginning in zip(records, read, beginnings, strict=True)
     )
-    evidence = Evidence(parts, basis, _smoothness(started, basis))
+    smoothness, *_ = Problem.pose(started, basis).reweighted().best_smoothness(SMOOTHNESS, FIRST_SMOOTHNESS)
+    evidence = Evidence(parts, basis, smoothness)
     residual = _residual(evidence)
     trusted = [
         _trusted(part, residual[rows], samples, only_after_reset=beginning.only_after_reset)
@@ -413,11 +414,6 @@ def _basis(model: AxisModel | None, samples: Sequence[Samples]) -> Basis:
         if basis.grid[0] - margin <= low and high <= basis.grid[-1] + margin:
             return basis
     return SurfaceBasis(np.linspace(low, high, VERTICES))
-
-
-def _smoothness(samples: Sequence[Samples], basis: Basis) -> float:
-    problem = Problem.pose(samples, basis).reweighted()
-    return problem.best_smoothness(SMOOTHNESS, FIRST_SMOOTHNESS)[0]
 
 
 def _outliers(residual: FloatArray, used: Mask) -> Mask:

@@ -283,9 +283,7 @@ def _forms(name: str, now: JointFit) -> Iterator[Candidate | Effect]:
 
 def _each(forms: Sequence[Candidate], gains: FloatArray) -> EachRecord | None:
     own = np.split(gains, np.cumsum([form.columns.shape[1] for form in forms[:-1]]))
-    parts = [form.effect(part) for form, part in zip(forms, own, strict=True)]
-    found = tuple(part for part in parts if part is not None)
-    return EachRecord(found) if len(found) == len(parts) else None
+    return EachRecord.of([form.effect(part) for form, part in zip(forms, own, strict=True)])
 
 
 class Search:

@@ -3,7 +3,7 @@
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import wraps
+from functools import partial, wraps
 from math import inf
 from typing import Any, ClassVar, Literal, NamedTuple, Self, TypeVar
 
@@ -88,6 +88,11 @@ class EffectContext:
             np.split(signal, np.cumsum([record.t.size for record in self.records[:-1]])) if self.records else [signal]
         )
 
+    def each(self, of: Callable[..., FloatArray], *signals: FloatArray) -> FloatArray:
+        """Return what `of` returns for each record, of its parts of the signals and its context, concatenated."""
+        parts = zip(*map(self.split, signals), self.records or (self,), strict=True)
+        return np.concatenate([of(*each) for each in parts])
+
 
 class Followed(NamedTuple):
     """A recorded quantity that an effect follows: name, reference value, and recorded range, in its unit."""
@@ -132,10 +137,7 @@ def by_record(
 
     @wraps(apply)
     def applied(effect: Effected, signal: FloatArray, around: EffectContext) -> FloatArray:
-        if not around.records:
-            return apply(effect, signal, around)
-        parts = zip(around.split(signal), around.records, strict=True)
-        return np.concatenate([apply(effect, part, record) for part, record in parts])
+        return around.each(partial(apply, effect), signal) if around.records else apply(effect, signal, around)
 
     return applied
 

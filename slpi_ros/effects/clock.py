@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import Candidate, Effect, EffectContext, FitContext
+from slpi_ros.effects.base import Candidate, Effect, EffectContext, FitContext, by_record
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, Scales, parameter
 
@@ -47,19 +47,18 @@ class Clock(Effect):
         fit=Fit("linear", _small, size=True),
     )  # fmt: skip
 
+    @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return what is read at the stamps, shape (N,), metres."""
         return self._at(1 / (1 + self.rate), signal, around)
 
+    @by_record
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement at times by the voltage's clock, shape (N,), metres."""
         return self._at(1 + self.rate, signal, around)
 
     def _at(self, scale: float, signal: FloatArray, around: EffectContext) -> FloatArray:
-        parts = zip(around.split(signal), around.split(around.t), strict=True)
-        return np.concatenate([
-            np.interp(t[:1] + scale * (t - t[:1]), t, part) if part.size else part for part, t in parts
-        ])  # fmt: skip
+        return np.interp(around.t[:1] + scale * around.since, around.t, signal) if signal.size else signal
 
     @classmethod
     def fit(cls, context: FitContext) -> Iterator[Candidate]:
@@ -68,11 +67,7 @@ class Clock(Effect):
             return
         seen = np.where(context.used, context.y - context.residual, context.h)
         column = (cls(STEP).apply(seen, context.around) - seen) / STEP
-        yield Candidate(column[:, None], cls._of)
-
-    @classmethod
-    def _of(cls, gains: FloatArray) -> "Clock":
-        return cls(float(gains[0]))
+        yield Candidate(column[:, None], lambda gains: cls(float(gains[0])))
 
     def describe(self) -> str:
         """Describe the rate."""

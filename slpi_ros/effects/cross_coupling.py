@@ -2,7 +2,6 @@
 
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -56,11 +55,8 @@ class CrossCoupling(Additive):
     def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield a candidate with the motion of all other axes."""
         if others := context.around.others:
-            yield Candidate(np.column_stack(list(others.values())), partial(cls._of, tuple(others)))
-
-    @classmethod
-    def _of(cls, axes: tuple[str, ...], gains: FloatArray) -> "CrossCoupling":
-        return cls(dict(zip(axes, gains.tolist(), strict=True)))
+            columns = np.column_stack(list(others.values()))
+            yield Candidate(columns, lambda gains: cls(dict(zip(others, gains.tolist(), strict=True))))
 
     @property
     def coupling(self) -> Mapping[str, float]:

@@ -8,12 +8,8 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import Candidate, Effect, EffectContext, FitContext, by_record, usual_step
-from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, at_speeds
+from slpi_ros.effects.excitation import Excitation, at_speeds
 from slpi_ros.effects.parameters import Fit, in_samples, parameter
-
-
-def _draw(path: DrivePath, limits: DriveLimits) -> None:
-    at_speeds(path, limits, 0.35, 0.65, straight=True)
 
 
 @dataclass(frozen=True)
@@ -31,7 +27,7 @@ class Delay(Effect):
     excitation = Excitation(
         "The same triangle at six speeds: a delay shifts its sharp corners by one time at every speed and leaves "
         "them sharp, where a lag rounds them and rate dependence changes the loop between them.",
-        _draw,
+        partial(at_speeds, low=0.35, high=0.65, straight=True),
     )
 
     seconds: float = parameter(
@@ -54,11 +50,8 @@ class Delay(Effect):
         dt = usual_step(context.t)
         for group, intervals in enumerate(((-4.0, 0.5, 2.0, 8.0), (32.0,))):
             for seconds in (dt * each for each in intervals):
-                yield Candidate(cls(seconds).column(context)[:, None], partial(cls._times, seconds), group=group)
-
-    @classmethod
-    def _times(cls, seconds: float, gains: FloatArray) -> "Delay":
-        return cls(seconds * float(gains[0]))
+                column = cls(seconds).column(context)[:, None]
+                yield Candidate(column, lambda gains, unit=seconds: cls(unit * float(gains[0])), group=group)
 
     @property
     def shift(self) -> float:

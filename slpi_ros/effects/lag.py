@@ -8,16 +8,12 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import Candidate, Effect, EffectContext, FitContext, StreamingEffect, by_record, usual_step
-from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, at_speeds
+from slpi_ros.effects.excitation import Excitation, at_speeds
 from slpi_ros.effects.filters import DAMPING, Dynamics, Hold, filtered, first_order, hold
 from slpi_ros.effects.parameters import Fit, in_samples, parameter
 
 # Number of time constants after which the piezo has the voltage of the command.
 SETTLED = 5.0
-
-
-def _draw(path: DrivePath, limits: DriveLimits) -> None:
-    at_speeds(path, limits, 0.45, 0.55, straight=False)
 
 
 @dataclass(frozen=True)
@@ -34,7 +30,7 @@ class Lag(Effect):
     excitation = Excitation(
         "The same small loop as a sine, slow to fast: hysteresis stays as it is, the phase of a delay grows with "
         "frequency at full amplitude, and a lag also loses amplitude.",
-        _draw,
+        partial(at_speeds, low=0.45, high=0.55, straight=False),
         separates=("delay",),
     )
 

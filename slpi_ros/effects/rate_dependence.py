@@ -3,7 +3,7 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
+from itertools import chain, product, repeat
 from math import copysign, exp, log, sqrt
 from typing import TYPE_CHECKING, Any
 
@@ -120,12 +120,8 @@ class RateDependence(Effect):
         """Return the voltage that the hysteresis feels, shape (N,), volts."""
         from slpi_ros.hysteresis.compiled import felt
 
-        times = around.split(around.t)
-        leads = (*self.initial, *(0.0,) * len(times))
-        law = self.threshold, self.onset_rate
-        parts = zip(times, around.split(signal), leads, strict=False)
-        whole = [felt(t, v, *law, lead) for t, v, lead in parts]
-        return whole[0] if len(whole) == 1 else np.concatenate(whole)
+        leads, law = chain(self.initial, repeat(0.0)), (self.threshold, self.onset_rate)
+        return around.each(lambda v, record: felt(record.t, v, *law, next(leads)), signal)
 
     def beside(self, v: FloatArray, u: FloatArray) -> FloatArray:
         """Return the reversible displacement, shape (N,), m, for applied voltages `v` and felt ones `u`, volts."""

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain, repeat
 from math import expm1, inf
 from typing import Any
 
@@ -232,6 +233,9 @@ def _mean_square_rates(
         return np.zeros_like(around.t)
     from slpi_ros.effects.paths import heated
 
-    times = around.split(around.t)
-    parts = zip(times, around.split(around.voltage), (*initial, *(0.0,) * len(times)), strict=False)
-    return np.concatenate([heated(np.diff(t, prepend=t[:1]), v, time_constant, first, most) for t, v, first in parts])
+    first = chain(initial, repeat(0.0))
+
+    def rates(t: FloatArray, v: FloatArray, _: EffectContext) -> FloatArray:
+        return heated(np.diff(t, prepend=t[:1]), v, time_constant, next(first), most)
+
+    return around.each(rates, around.t, around.voltage)

@@ -18,12 +18,13 @@ from slpi_ros.effects.base import (
     FollowedGain,
     StreamingEffect,
     Unsure,
+    by_record,
     decays,
     longest,
 )
 from slpi_ros.effects.excitation import Excitation, full_loops
 from slpi_ros.effects.filters import filtered, hold
-from slpi_ros.effects.parameters import Fit, Leaf, parameter, require, text
+from slpi_ros.effects.parameters import Fit, parameter, require, text
 from slpi_ros.effects.readings import ReadingsFilter, best_filter, line_after
 from slpi_ros.errors import length
 from slpi_ros.io.record import Course
@@ -85,7 +86,18 @@ class Quantity:
         value = around.surroundings.get(self.key)
         if value is None:
             return np.zeros_like(around.t)
-        return _lagged(_advanced(value - self.reference, self.lead, around), self.time_constant, around)
+        return self._felt(value - self.reference, around)
+
+    @by_record
+    def _felt(self, moved: FloatArray, around: EffectContext) -> FloatArray:
+        """Return what the stage feels of a deviation, shape (N,): at the end it stays, at the start it is at rest."""
+        if self.lead:
+            moved = np.interp(around.t + self.lead, around.t, moved)
+        grid = around.uniform
+        if not (self.time_constant and grid.dt > 0.0):
+            return moved
+        now, before, kept = hold(grid.dt, self.time_constant)
+        return moved[0] + grid.off(filtered([now, before], [1.0, -kept], grid.on(moved - moved[0])))
 
 
 @dataclass(frozen=True)
@@ -164,10 +176,6 @@ class Surroundings(Effect):
         """Return whether the sensitivity changes by little."""
         changes = sum(abs(one.sensitivity_gain) * (one.highest - one.lowest) for one in self.quantities)
         return bool(changes <= LARGEST)
-
-    def free_leaves(self) -> list[Leaf]:
-        """Return the fitted numbers; what is 0 is not there."""
-        return [leaf for leaf in super().free_leaves() if not leaf.place.startswith("initial")]
 
     def parts(self, around: EffectContext) -> tuple[FloatArray, FloatArray]:
         """Return the factor of the sensitivity, and the displacement (m), shape (N,) each."""
@@ -362,30 +370,6 @@ def _with_filter(one: Quantity, courses: Sequence[Course]) -> Quantity:
     """Return a quantity with the filter of its readings that takes the least time, of those that suit the records."""
     found = min((best_filter(course, one.lead) for course in courses), default=ReadingsFilter())
     return replace(one, averaging=found.time_constant, ahead=found.ahead, reading_error=found.error)
-
-
-def _advanced(value: FloatArray, lead: float, around: EffectContext) -> FloatArray:
-    """Return a quantity a time (s) later, shape (N,); at the end of each record it stays."""
-    if not lead:
-        return value
-    pairs = zip(around.split(value), around.split(around.t), strict=True)
-    return np.concatenate([np.interp(t + lead, t, own) for own, t in pairs])
-
-
-def _lagged(value: FloatArray, time_constant: float, around: EffectContext) -> FloatArray:
-    """Return a quantity after a first-order lag, shape (N,), from equilibrium at the start of each record."""
-    if not time_constant:
-        return value
-    parts = []
-    for own, record in zip(around.split(value), around.records or (around,), strict=True):
-        grid = record.uniform
-        if not (own.size and grid.dt > 0.0):
-            parts.append(own)
-            continue
-        now, before, kept = hold(grid.dt, time_constant)
-        moved = grid.on(own - own[0])
-        parts.append(own[0] + grid.off(filtered([now, before], [1.0, -kept], moved)))
-    return np.concatenate(parts)
 
 
 def _described(one: Quantity) -> str:

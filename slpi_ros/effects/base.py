@@ -1,5 +1,6 @@
 """The `Effect` protocol with the facts of an effect, its context, and the candidates and views of a fit."""
 
+import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -261,6 +262,11 @@ class Effect(ABC):
     def describe(self) -> str:
         """Describe the effect with its parameter values in one sentence."""
 
+    def __init_subclass__(cls) -> None:
+        """Name an effect after its class, unless it says otherwise: `RateDependence` is ``rate_dependence``."""
+        if "name" not in vars(cls):
+            cls.name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__).lower()
+
     def __post_init__(self) -> None:
         require_facts(self)
 
@@ -460,14 +466,13 @@ class Additive(Effect):
 class Candidate:
     """One form of an effect for the identification, linear in its gains."""
 
-    # Contribution to the displacement (m) for a unit value of each of the k gains, shape (N, k).
+    # Contribution to the displacement (m) for a unit value of each of the k gains, shape (N, k): of the initial states
+    # of the records first, each of which belongs to one record, then of the effect.
     columns: FloatArray
     # Returns the effect for gains of shape (k,), or None if the gains are not admissible.
     effect: Callable[[FloatArray], Effect | None]
     # Number of trailing columns whose gains must be non-negative; if not 0, `effect` receives only these gains.
     positive: int = 0
-    # Number of leading columns that describe the initial state of the records; each belongs to one record.
-    starting: int = 0
     # Forms of different groups are refined each by itself, as they lead to different parameters.
     group: int = 0
 

@@ -30,7 +30,6 @@ def _small(value: float, scales: Scales) -> float:
 class Clock(Effect):
     """Stamps ``(1 + rate) t`` of the displacement at the time ``t`` from the record's start."""
 
-    name = "clock"
     side = "record"
     what = "the clock of the displacement's stamps goes faster or slower than that of the voltage's"
     compensated = "no, it is of the record's stamps"
@@ -44,7 +43,7 @@ class Clock(Effect):
 
     rate: float = parameter(
         "", "by how much the displacement's clock goes faster, relative: 1e-6 is 1 ppm", -0.1, 0.1,
-        fit=Fit("linear", _small, size=True),
+        fit=Fit("linear", _small),
     )  # fmt: skip
 
     @by_record

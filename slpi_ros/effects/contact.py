@@ -32,7 +32,6 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 class Contact(Effect):
     """A change of the slope at one displacement, ``y = x + (gain - 1) max(x - position, 0)``."""
 
-    name = "contact"
     side = "stage"
     what = "from a displacement on the stage works against something: a stop, a sample, a cable"
     compensated = "exactly"

@@ -62,7 +62,6 @@ class Creep(Effect):
     """
 
     # ``h_0``, the `origin`, is where creep adds nothing; in a fit, where there is none, the first one of each record.
-    name = "creep"
     side = "stage"
     is_filter = True
     what = "slow relaxation after each movement, from 0.1 s on"
@@ -166,19 +165,19 @@ class Creep(Effect):
             for taus in (*single, *several):
                 starting = _settling(taus.tolist(), context.around, context.used)
                 columns = np.column_stack([starting, *cls._creeping(taus, context)])
-                yield Candidate(columns, partial(cls._each, taus), taus.size, starting.shape[1])
+                yield Candidate(columns, partial(cls._each, taus), taus.size)
             for exponent in POWERS:
                 unit = cls(exponent=exponent, gain=1.0)
                 starting = unit.starting(context.around, context.used)
                 columns = np.column_stack([starting, unit.column(context)])
-                yield Candidate(columns, partial(cls._of_power, exponent), 1, starting.shape[1], group=1)
+                yield Candidate(columns, partial(cls._of_power, exponent), 1, group=1)
         for slow in LAW_TO:
             first, last = max(FASTEST, LAW_SAMPLES * step), slow * most
             if last > 10 * first:
                 taus = np.geomspace(first, last, max(LAW_FEWEST, 1 + round(LAW_PER_DECADE * np.log10(last / first))))
                 starting = _settling(taus.tolist(), context.around, context.used)
                 columns = np.column_stack([starting, np.sum(cls._creeping(taus, context), axis=0)])
-                yield Candidate(columns, partial(cls._law, taus), 1, starting.shape[1])
+                yield Candidate(columns, partial(cls._law, taus), 1)
 
     @classmethod
     def _creeping(cls, taus: FloatArray, context: FitContext) -> list[FloatArray]:

@@ -25,7 +25,6 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 class CrossCoupling(Additive):
     """Linear coupling, ``y = x + sum_j gain_j m_j``, with ``m_j`` the motion of axis j; the stage model inverts it."""
 
-    name = "cross_coupling"
     side = "stage"
     what = "part of the movement of another axis"
     compensated = "if both axes are in one node"

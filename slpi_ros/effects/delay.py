@@ -16,7 +16,6 @@ from slpi_ros.effects.parameters import Fit, in_samples, parameter
 class Delay(Effect):
     """Transport delay, or offset between the stamps of voltage and displacement; its inverse needs future setpoints."""
 
-    name = "delay"
     acts_on = "voltage"
     side = "stage"
     what = "voltage and displacement are shifted in time"
@@ -32,7 +31,7 @@ class Delay(Effect):
 
     seconds: float = parameter(
         "s", "delay of the displacement; negative: stamped too early", -100, 100,
-        fit=Fit("linear", in_samples, size=True),
+        fit=Fit("linear", in_samples),
     )  # fmt: skip
 
     @by_record
@@ -50,8 +49,11 @@ class Delay(Effect):
         dt = usual_step(context.t)
         for group, intervals in enumerate(((-4.0, 0.5, 2.0, 8.0), (32.0,))):
             for seconds in (dt * each for each in intervals):
-                column = cls(seconds).column(context)[:, None]
-                yield Candidate(column, lambda gains, unit=seconds: cls(unit * float(gains[0])), group=group)
+                yield Candidate(cls(seconds).column(context)[:, None], partial(cls._times, seconds), group=group)
+
+    @classmethod
+    def _times(cls, seconds: float, gains: FloatArray) -> "Delay":
+        return cls(seconds * float(gains[0]))
 
     @property
     def shift(self) -> float:

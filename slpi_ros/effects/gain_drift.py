@@ -27,7 +27,6 @@ class GainDrift(Effect):
     # ``g`` is 0 at the record's start, linear between knots, and constant after the last knot. The knots belong to the
     # record; after it the sensitivity stays at its last value, see `lasting`. The factor scales hysteresis, creep and
     # resonance, and acts before the cross coupling, so that other axes receive the scaled motion.
-    name = "gain_drift"
     side = "stage"
     what = "the sensitivity changes slowly"
     compensated = "as it was at the end of the record; its course belongs to the record"

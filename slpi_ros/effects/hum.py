@@ -33,7 +33,7 @@ class Line:
     frequency: float = parameter(
         "Hz", "frequency", 0, 1e7, above=True, fit=Fit("relative", lambda _, of: 1e-3 / of.duration, 1e-3)
     )
-    amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0, size=True))
+    amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0))
     phase: float = parameter("rad", "phase at the record's start", -1e6, 1e6, fit=Fit("angle", 1e-4))
 
 
@@ -41,7 +41,6 @@ class Line:
 class Hum(Additive):
     """Sinusoids in time, ``y = x + sum_k amplitude_k sin(2 pi frequency_k t + phase_k)``, on the record's clock."""
 
-    name = "hum"
     side = "record"
     what = "disturbance that is periodic in time, one or several lines"
     compensated = "no"

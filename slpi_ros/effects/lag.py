@@ -20,7 +20,6 @@ SETTLED = 5.0
 class Lag(Effect):
     """First-order lag, ``tau du/dt = v - u``."""
 
-    name = "lag"
     acts_on = "voltage"
     side = "stage"
     what = "first-order lag of the voltage, as of an amplifier, before the hysteresis"
@@ -35,7 +34,7 @@ class Lag(Effect):
     )
 
     time_constant: float = parameter(
-        "s", "time constant tau", 0, 1e4, above=True, fit=Fit("relative", in_samples, 1e-6, size=True)
+        "s", "time constant tau", 0, 1e4, above=True, fit=Fit("relative", in_samples, 1e-6)
     )
 
     @by_record

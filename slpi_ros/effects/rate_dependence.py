@@ -56,7 +56,6 @@ class RateDependence(Effect):
     H. Eyring, Viscosity, plasticity, and diffusion as examples of absolute reaction rates, J. Chem. Phys. 4, 283, 1936.
     """
 
-    name = "rate_dependence"
     acts_on = "hysteresis"
     side = "stage"
     what = (
@@ -75,7 +74,7 @@ class RateDependence(Effect):
 
     threshold: float = parameter(
         "V", "half-width c that loops gain for each factor of e in the rate", 0, 1e5,
-        fit=Fit("logarithmic", 1e-4, 1e-6, size=True),
+        fit=Fit("logarithmic", 1e-4, 1e-6),
     )  # fmt: skip
     onset_rate: float = parameter(
         "V/s", "rate s0 above which they widen", 1e-12, 1e12, fit=Fit("logarithmic", 1e-4, 1e-9)

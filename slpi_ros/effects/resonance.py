@@ -233,7 +233,6 @@ class Resonance(Effect):
     is unstable runs backward in time, see `invert`.
     """
 
-    name = "resonance"
     side = "stage"
     is_filter = True
     what = "modes of the mechanics, ringing or well damped, each with its share of the motion"

@@ -35,7 +35,6 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 class Saturation(Effect):
     """Limits of the voltage at the piezo, which the limits of the command keep, see `passes`."""
 
-    name = "saturation"
     acts_on = "voltage"
     side = "stage"
     what = "the amplifier clips"

@@ -54,7 +54,6 @@ class SelfHeating(Effect):
 
     # At each sample the rate up to the one before counts, so that the inverse needs no voltage that it is to return. A
     # change of the voltage in no time has no rate. The factor never changes by more than `MOST`.
-    name = "self_heating"
     side = "stage"
     what = "the sensitivity follows how fast the voltage moves, within seconds to minutes"
     compensated = "yes, from a cold start"
@@ -70,7 +69,7 @@ class SelfHeating(Effect):
 
     gain: float = parameter(
         "s^2/V^2", "relative change of the sensitivity for each unit of the mean square rate of the voltage", -1e6, 1e6,
-        fit=Fit("linear", size=True),
+        fit=Fit("linear"),
     )  # fmt: skip
     time_constant: float = parameter(
         "s", "time constant with which the stage warms up and cools down", 1e-3, 1e7,
@@ -144,7 +143,7 @@ class SelfHeating(Effect):
                 yield Candidate(own, partial(cls._through, tau, most, low, high))
                 warm = [cooling[:, [k]] * moved for k in range(cooling.shape[1])]
                 columns = np.column_stack([*warm, own])
-                yield Candidate(columns, partial(cls._through, tau, most, low, high), starting=2 * len(warm))
+                yield Candidate(columns, partial(cls._through, tau, most, low, high))
 
     @classmethod
     def _through(cls, tau: float, most: float, low: float, high: float, found: FloatArray) -> "SelfHeating | None":

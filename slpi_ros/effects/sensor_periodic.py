@@ -46,7 +46,6 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 class SensorPeriodic(Effect):
     """Periodic sensor error, ``y = x + amplitude sin(2 pi x / period + phase)``."""
 
-    name = "sensor_periodic"
     side = "sensor"
     what = "interferometer error, periodic in the displacement"
     compensated = "not the stage: the readings are corrected, as long as the zero of the sensor does not move"
@@ -62,7 +61,7 @@ class SensorPeriodic(Effect):
         "m", "period in displacement, such as half a wavelength", 1e-12, 1e3,
         fit=Fit("relative", lambda value, _: 1e-5 * abs(value), SHORTEST, LONGEST),
     )  # fmt: skip
-    amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0, most=LONGEST, size=True))
+    amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0, most=LONGEST))
     phase: float = parameter("rad", "phase at displacement 0", -1e3, 1e3, fit=Fit("angle", 1e-4))
 
     def __post_init__(self) -> None:

@@ -33,7 +33,6 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 class Slew(Effect):
     """Limit of the rate of the voltage at the piezo, ``|du/dt| <= rate``, which else is the command."""
 
-    name = "slew"
     acts_on = "voltage"
     side = "stage"
     what = "the amplifier's current limits how fast its voltage changes"

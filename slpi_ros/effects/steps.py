@@ -28,7 +28,6 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 class Steps(Additive):
     """Jumps of the zero, ``y = x + sum of the sizes at times up to t``, on the record's clock."""
 
-    name = "steps"
     side = "record"
     what = "sudden jumps of the zero that stay: slips of the mount or the sensor, fringe jumps"
     compensated = "no"

@@ -97,7 +97,7 @@ class Quantity:
         if not (self.time_constant and grid.dt > 0.0):
             return moved
         now, before, kept = hold(grid.dt, self.time_constant)
-        return moved[0] + grid.off(filtered([now, before], [1.0, -kept], grid.on(moved - moved[0])))
+        return np.asarray(moved[0] + grid.off(filtered([now, before], [1.0, -kept], grid.on(moved - moved[0]))))
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,6 @@ class Surroundings(Effect):
     `offset_gain` and `sensitivity_gain`, and ``x0`` is `origin`.
     """
 
-    name = "surroundings"
     side = "stage"
     what = "zero or sensitivity follow a recorded quantity (temperature, load, humidity, pressure)"
     compensated = "yes, if the quantity is measured in use"
@@ -259,7 +258,6 @@ class Surroundings(Effect):
                     yield Candidate(
                         np.column_stack([starting, *own_columns]),
                         partial(cls._through, one, size, low, with_offset, len(own_columns)),
-                        starting=starting.shape[1],
                         group=group,
                     )
 

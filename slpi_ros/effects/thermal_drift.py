@@ -33,7 +33,6 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 class ThermalDrift(Additive):
     """A displacement that depends on time only, linear between knots and constant outside."""
 
-    name = "thermal_drift"
     side = "record"
     what = "slow change that does not follow the voltage"
     compensated = "no"

@@ -25,7 +25,6 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 class SupplySag(Effect):
     """An error of the sensor in proportion to the speed, in either direction: ``y = x + gain |dx/dt|``."""
 
-    name = "supply_sag"
     side = "sensor"
     what = "the reading changes with the speed, in either direction alike"
     compensated = "not the stage: the readings are corrected"

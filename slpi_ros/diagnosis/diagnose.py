@@ -311,12 +311,8 @@ def _repeatability(now: JointFit) -> Repeatability:
 
 def _run(model: AxisModel, part: Part, *, of_record: bool) -> FreeRun:
     model = model.surrounded({key: (part.t, value) for key, value in part.surroundings.items()})
-    known, starts = _known(part), _starts(model, part)
+    known, starts = _known(part), likely_starts(model, float(part.v[0]), part.history)
     return free_run(model, part.t, part.v, part.y, part.used, known, starts, others=part.others, of_record=of_record)
-
-
-def _starts(model: AxisModel, part: Part) -> list[Start]:
-    return likely_starts(model, float(part.v[0]), part.history)
 
 
 def _known(part: Part) -> Mask:
@@ -376,7 +372,7 @@ def _compared(bare: AxisModel, one: JointFit) -> Given:
     for part, rows, begin in zip(one.evidence.parts, one.evidence.slices, begins, strict=True):
         chosen = _known(part)
         target = (one.target - one.settling)[rows][chosen]
-        starts = _starts(bare, part)
+        starts = likely_starts(bare, float(part.v[0]), part.history)
         tried = [replace(bare, start=start).simulate(part.t, one.u[rows])[chosen] for start in starts]
         h = min(tried, key=lambda h: float(np.std(target - h)))
         errors.append(np.var(target - h))

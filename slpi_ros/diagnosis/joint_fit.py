@@ -353,6 +353,7 @@ class JointFit:
 
     def __init__(self, evidence: Evidence, effects: Sequence[Effect] = (), like: "JointFit | None" = None) -> None:
         self.evidence, self.effects = evidence, in_order(effects)
+        self.t, self.y, self.used = evidence.t, evidence.y, evidence.used
         applied, self.u, self._aside = Chain.of(self.effects).reaching(evidence.v, evidence.around)
         # Context passed to the effects.
         self.around = evidence.around.driven(applied)
@@ -406,21 +407,6 @@ class JointFit:
             effect.name: gains[first:end]
             for effect, (first, end) in zip(self.effects, pairwise(self.starts), strict=True)
         }
-
-    @property
-    def t(self) -> FloatArray:
-        """Time, shape (N,), seconds."""
-        return self.evidence.t
-
-    @property
-    def y(self) -> FloatArray:
-        """Measured displacement, shape (N,), metres."""
-        return self.evidence.y
-
-    @property
-    def used(self) -> Mask:
-        """Mask of the samples used in the fit, shape (N,)."""
-        return self.evidence.used
 
     @property
     def target(self) -> FloatArray:

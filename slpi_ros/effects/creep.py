@@ -157,26 +157,24 @@ class Creep(Effect):
     @classmethod
     def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield single relaxations from fast to slow, and combinations of several."""
-        step, most = usual_step(context.t), longest(context.around)
+        step, most, at = usual_step(context.t), longest(context.around), (context.around, context.used)
         shortest = max(10 * step, FASTEST)
         if shortest < 0.5 * most:
             single = [np.array([tau]) for tau in np.geomspace(shortest, 0.5 * most, SINGLE)]
             several = [np.geomspace(shortest, share * most, count) for count, share in SEVERAL]
             for taus in (*single, *several):
-                starting = _settling(taus.tolist(), context.around, context.used)
-                columns = np.column_stack([starting, *cls._creeping(taus, context)])
+                columns = np.column_stack([_settling(taus.tolist(), *at), *cls._creeping(taus, context)])
                 yield Candidate(columns, partial(cls._each, taus), taus.size)
             for exponent in POWERS:
                 unit = cls(exponent=exponent, gain=1.0)
-                starting = unit.starting(context.around, context.used)
-                columns = np.column_stack([starting, unit.column(context)])
+                columns = np.column_stack([unit.starting(*at), unit.column(context)])
                 yield Candidate(columns, partial(cls._of_power, exponent), 1, group=1)
         for slow in LAW_TO:
             first, last = max(FASTEST, LAW_SAMPLES * step), slow * most
             if last > 10 * first:
                 taus = np.geomspace(first, last, max(LAW_FEWEST, 1 + round(LAW_PER_DECADE * np.log10(last / first))))
-                starting = _settling(taus.tolist(), context.around, context.used)
-                columns = np.column_stack([starting, np.sum(cls._creeping(taus, context), axis=0)])
+                together = np.sum(cls._creeping(taus, context), axis=0)
+                columns = np.column_stack([_settling(taus.tolist(), *at), together])
                 yield Candidate(columns, partial(cls._law, taus), 1)
 
     @classmethod

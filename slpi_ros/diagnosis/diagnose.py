@@ -311,12 +311,8 @@ def _repeatability(now: JointFit) -> Repeatability:
 
 def _run(model: AxisModel, part: Part, *, of_record: bool) -> FreeRun:
     model = model.surrounded({key: (part.t, value) for key, value in part.surroundings.items()})
-    known, starts = _known(part), _starts(model, part)
+    known, starts = _known(part), likely_starts(model, float(part.v[0]), part.history)
     return free_run(model, part.t, part.v, part.y, part.used, known, starts, others=part.others, of_record=of_record)
-
-
-def _starts(model: AxisModel, part: Part) -> list[Start]:
-    return likely_starts(model, float(part.v[0]), part.history)
 
 
 def _known(part: Part) -> Mask:
@@ -370,33 +366,22 @@ def _fits_anew(model: AxisModel, answer: Answer, own: Mask, given_rms: float) ->
 
 def _compared(bare: AxisModel, one: JointFit) -> Given:
     """Compare the given hysteresis with the measured displacement minus the effects of the joint fit `one`."""
-    errors, refitted, gains, deviations = [], [], [], []
+    errors, refitted, gains = [], [], []
     # Like the given hysteresis, the refitted one has monotone branches.
     hysteresis, begins = one.hysteresis()
     for part, rows, begin in zip(one.evidence.parts, one.evidence.slices, begins, strict=True):
         chosen = _known(part)
         target = (one.target - one.settling)[rows][chosen]
-        starts = _starts(bare, part)
+        starts = likely_starts(bare, float(part.v[0]), part.history)
         tried = [replace(bare, start=start).simulate(part.t, one.u[rows])[chosen] for start in starts]
         h = min(tried, key=lambda h: float(np.std(target - h)))
         errors.append(np.var(target - h))
         own = replace(bare, hysteresis=hysteresis, start=Start(float(one.u[rows][0]), begin, part.history))
         refitted.append(np.var(target - own.simulate(part.t, one.u[rows])[chosen]))
-        gain, deviation = _gain(h, target)
-        gains.append(gain)
-        deviations.append(deviation)
-    gain, variance = _weighted(np.array(gains), np.array(deviations))
-    return Given(
-        rms=0.0,
-        hysteresis_rms=float(np.sqrt(np.mean(errors))),
-        refitted_rms=float(np.sqrt(np.mean(refitted))),
-        gain=gain,
-        gain_deviation=float(np.sqrt(variance)),
-        zero_moved=None,
-        motion=0.0,
-        own_rms=0.0,
-        explained=True,
-    )
+        gains.append(_gain(h, target))
+    gain, variance = _weighted(*map(np.array, zip(*gains, strict=True)))
+    given_rms, refitted_rms, deviation = (float(np.sqrt(x)) for x in (np.mean(errors), np.mean(refitted), variance))
+    return Given(given_rms, refitted_rms, gain, deviation)
 
 
 def _since(own: Mask, one: JointFit) -> Given:
@@ -413,17 +398,8 @@ def _since(own: Mask, one: JointFit) -> Given:
     after, variance_after = _weighted(gains[~own], deviations[~own])
     left_out = one.held_out.records[own]
     refitted = one.held_out.rms
-    return Given(
-        rms=0.0,
-        hysteresis_rms=float(np.sqrt(np.nanmean(left_out))) if np.isfinite(left_out).any() else refitted,
-        refitted_rms=refitted,
-        gain=after - before,
-        gain_deviation=float(np.sqrt(variance + variance_after)),
-        zero_moved=None,
-        motion=0.0,
-        own_rms=0.0,
-        explained=True,
-    )
+    given_rms = float(np.sqrt(np.nanmean(left_out))) if np.isfinite(left_out).any() else refitted
+    return Given(given_rms, refitted, after - before, float(np.sqrt(variance + variance_after)))
 
 
 def _weighted(values: FloatArray, deviations: FloatArray) -> tuple[float, float]:

@@ -1,24 +1,13 @@
 """Free parameters of effects as vectors, with their bounds, step sizes and uncertainties."""
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from math import exp, log
-from typing import ClassVar
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import (
-    Candidate,
-    Effect,
-    EffectBase,
-    EffectContext,
-    FitContext,
-    ResidualContext,
-    Side,
-    Signal,
-    usual_step,
-)
+from slpi_ros.effects.base import Candidate, Effect, EffectContext, FitContext, usual_step
 from slpi_ros.effects.parameters import Fit, Leaf, Scales
 
 # Largest change of a parameter in one step, relative to its magnitude, and of the logarithm of one that ranges over
@@ -27,41 +16,39 @@ LARGEST_STEP, LARGEST_LOG_STEP = 0.7, 2.0
 
 
 @dataclass(frozen=True)
-class EachRecord(EffectBase):
+class EachRecord(Effect):
     """An effect with separate parameters in each record, such as drift or lines: its `parts`."""
 
     parts: tuple[Effect, ...]
-    side: ClassVar[Side] = "record"
-    acts_on: ClassVar[Signal] = "displacement"
+    side = "record"
 
     def __post_init__(self) -> None:
         """Do nothing: each part has been validated."""
 
+    @classmethod
+    def of(cls, parts: Sequence[Effect | None]) -> "EachRecord | None":
+        """Return the effect of these parts; None if one is missing."""
+        found = tuple(part for part in parts if part is not None)
+        return cls(found) if len(found) == len(parts) else None
+
     @property
-    def name(self) -> str:
+    def name(self) -> str:  # type: ignore[override]
         """The effect's name."""
         return self.parts[0].name
 
-    @property
-    def uncertainty(self) -> Mapping[str, float]:
-        """Standard deviations of the parameters in the first record, by name."""
-        return self.parts[0].uncertainty
-
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the output for the concatenated signals of all records, shape (N,), metres."""
-        records = zip(self.parts, around.split(signal), around.records, strict=True)
-        return np.concatenate([part.apply(own, record) for part, own, record in records])
+        parts = iter(self.parts)
+        return around.each(lambda own, record: next(parts).apply(own, record), signal)
 
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the input signal, shape (N,), metres, for an output signal of all records."""
-        records = zip(self.parts, around.split(signal), around.records, strict=True)
-        return np.concatenate([part.invert(own, record) for part, own, record in records])
+        parts = iter(self.parts)
+        return around.each(lambda own, record: next(parts).invert(own, record), signal)
 
     def joined(self, other: "EachRecord") -> "EachRecord | None":
         """Return the effects of both, record by record."""
-        parts = [one.joined(two) for one, two in zip(self.parts, other.parts, strict=True)]
-        found = tuple(part for part in parts if part is not None)
-        return EachRecord(found) if len(found) == len(parts) else None
+        return EachRecord.of([one.joined(two) for one, two in zip(self.parts, other.parts, strict=True)])
 
     @property
     def courses(self) -> tuple[tuple[float, ...], ...]:
@@ -75,9 +62,7 @@ class EachRecord(EffectBase):
 
     def only_plausible(self, view: FitContext) -> "EachRecord | None":
         """Return the effect of each record without those of its parts that are not plausible."""
-        parts = [part.only_plausible(view.of_record(k)) for k, part in enumerate(self.parts)]
-        found = tuple(part for part in parts if part is not None)
-        return EachRecord(found) if len(found) == len(parts) else None
+        return EachRecord.of([part.only_plausible(view.of_record(k)) for k, part in enumerate(self.parts)])
 
     def free_leaves(self) -> list[Leaf]:
         """Return the fitted numbers of all records."""
@@ -93,7 +78,7 @@ class EachRecord(EffectBase):
         return "; ".join(f"record {k}: {part.describe()}" for k, part in enumerate(self.parts, 1))
 
     @classmethod
-    def fit(cls, left: ResidualContext) -> Iterator[Candidate | Effect]:
+    def fit(cls, left: FitContext) -> Iterator[Candidate | Effect]:
         """Yield nothing: candidates come from the effect of each record."""
         yield from ()
 
@@ -159,4 +144,4 @@ def certain(effect: Effect, spread: Sequence[float]) -> Effect:
         place: min(deviation * (value if fit.kind == "logarithmic" else 1.0), LEAST_KNOWN)
         for (place, fit, value), deviation in zip(_fitted(effect), spread, strict=True)
     }
-    return replace(effect, uncertainty=found)  # type: ignore[type-var]
+    return replace(effect, uncertainty=found)

@@ -153,13 +153,10 @@ def _of_variables(records: Sequence[Signals]) -> Iterator[Left]:
         if name == "direction":
             # Only what rising and falling voltage differ by: the rest goes with the voltage.
             columns = columns[:, :KNOTS] - columns[:, KNOTS:]
-        share, fitted = _share(columns, records)
-        if share >= LEAST_SHARE:
-            advice = HINTS[name]
-            if name == "time" and (turns := min(_turns(record).size for record in records)) < FEWEST_TURNS:
-                advice = f"a record with {turns} turns cannot tell time from its drive: record more cycles, or {advice}"
-            evidence = _evidence(name, unit, share, x, fitted, up if branches else None)
-            yield Left(name, share, f"{evidence}; {advice}", _curve(x, fitted), unit)
+        advice = HINTS[name]
+        if name == "time" and (turns := min(_turns(record).size for record in records)) < FEWEST_TURNS:
+            advice = f"a record with {turns} turns cannot tell time from its drive: record more cycles, or {advice}"
+        yield _of_variable(name, unit, x, columns, records, advice, up if branches else None)
 
 
 def _of_surroundings(records: Sequence[Signals]) -> Iterator[Left]:
@@ -167,10 +164,7 @@ def _of_surroundings(records: Sequence[Signals]) -> Iterator[Left]:
         if all(key in record.surroundings for record in records):
             x = np.concatenate([record.surroundings[key] for record in records])
             if np.ptp(x) > 0.0:
-                share, fitted = _share(_hats(x, KNOTS_OF_QUANTITY, even=False), records)
-                if share >= LEAST_SHARE:
-                    evidence = _evidence(key, "", share, x, fitted, None)
-                    yield Left(key, share, f"{evidence}; {hint(key)}", _curve(x, fitted))
+                yield _of_variable(key, "", x, _hats(x, KNOTS_OF_QUANTITY, even=False), records, hint(key))
 
 
 def _variables(record: Signals) -> dict[str, FloatArray]:
@@ -228,24 +222,27 @@ def _share(matrix: FloatArray, records: Sequence[Signals]) -> tuple[float, Float
     return float(np.clip(share, 0.0, 1.0)), matrix @ fitted(whole, right)
 
 
-def _evidence(name: str, unit: str, share: float, x: FloatArray, fitted: FloatArray, rate: FloatArray | None) -> str:
-    """Return a clause with the extremes of a fitted function; `rate` is given where rising and falling differ."""
+def _of_variable(
+    name: str,
+    unit: str,
+    x: FloatArray,
+    columns: FloatArray,
+    records: Sequence[Signals],
+    advice: str,
+    rate: FloatArray | None = None,
+) -> Left:
+    """Return what columns predict that are functions of the variable `x`; `rate`: where rising and falling differ."""
+    share, fitted = _share(columns, records)
 
     def at(k: int) -> str:
         branch = "" if rate is None else " while rising" if rate[k] > 0.0 else " while falling"
-        return f"{length(fitted[k])} at {_quantity(x[k], unit)}{branch}"
+        where = length(x[k]) if unit == "m" else f"{x[k]:.3g} {unit}".rstrip()
+        return f"{length(fitted[k])} at {where}{branch}"
 
-    extremes = at(int(np.argmin(fitted))), at(int(np.argmax(fitted)))
-    return f"{share:.0%} of the mean square depends on the {name}: from {extremes[0]} to {extremes[1]}"
-
-
-def _quantity(value: float, unit: str) -> str:
-    return length(value) if unit == "m" else f"{value:.3g} {unit}".rstrip()
-
-
-def _curve(x: FloatArray, fitted: FloatArray) -> tuple[FloatArray, FloatArray]:
+    extremes = f"from {at(int(np.argmin(fitted)))} to {at(int(np.argmax(fitted)))}"
+    evidence = f"{share:.0%} of the mean square depends on the {name}: {extremes}; {advice}"
     order = np.argsort(x)[:: max(1, x.size // 400)]
-    return x[order], fitted[order]
+    return Left(name, share, evidence, (x[order], fitted[order]), unit)
 
 
 def _of_lines(records: Sequence[Signals]) -> Iterator[Left]:

@@ -9,7 +9,7 @@ other records, and only offset and initial relaxation are estimated from the hel
 """
 
 import operator
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property, reduce
 from itertools import pairwise
@@ -241,24 +241,12 @@ class Columns:
         """Fit hysteresis and columns to all samples of `y` (m, (N,)); return parameters (p,) and gains (k,)."""
         # The parameters are in units of the problem's scale, without the constraint of monotone branches.
         own = self.equations.columns(y)
-        solved = np.column_stack([own.solved, self.solved])
-        cross = self.at.T @ own.at
-        products = np.block([[own.at.T @ own.at, cross.T], [cross, self._products]])
-        gains = _gains(np.column_stack([own.whole, self.whole]), products, solved)
-        return solved @ _missed(gains), gains
-
-
-def _missed(gains: FloatArray) -> FloatArray:
-    """Return the weights ``[1, -gains]``, shape (1 + k,), with which target and columns add up to the residual."""
-    return np.concatenate([[1.0], -gains])
-
-
-def _gains(projected: FloatArray, products: FloatArray, parameters: FloatArray) -> FloatArray:
-    """Return the gains, shape (k,), of the columns in a joint fit with the hysteresis to the first column."""
-    # `projected` is ``A'J``, `parameters` of the hysteresis are those of the best fit to each column, shape (p, 1 + k)
-    # each, and `products` is ``J'J``, shape (1 + k, 1 + k).
-    left = products[1:] - projected[:, 1:].T @ parameters
-    return solved(left[:, 1:], left[:, 0])
+        # Products with the design matrix, and the best hysteresis, of target and columns, shape (p, 1 + k) each.
+        projected = np.column_stack([own.whole, self.whole])
+        parameters = np.column_stack([own.solved, self.solved])
+        left = np.column_stack([self.at.T @ own.at, self._products]) - projected[:, 1:].T @ parameters
+        gains = solved(left[:, 1:], left[:, 0])
+        return parameters @ np.concatenate([[1.0], -gains]), gains
 
 
 def _solved(factor: Factor, of: FloatArray) -> FloatArray:
@@ -365,6 +353,7 @@ class JointFit:
 
     def __init__(self, evidence: Evidence, effects: Sequence[Effect] = (), like: "JointFit | None" = None) -> None:
         self.evidence, self.effects = evidence, in_order(effects)
+        self.t, self.y, self.used = evidence.t, evidence.y, evidence.used
         applied, self.u, self._aside = Chain.of(self.effects).reaching(evidence.v, evidence.around)
         # Context passed to the effects.
         self.around = evidence.around.driven(applied)
@@ -420,26 +409,6 @@ class JointFit:
         }
 
     @property
-    def t(self) -> FloatArray:
-        """Time, shape (N,), seconds."""
-        return self.evidence.t
-
-    @property
-    def y(self) -> FloatArray:
-        """Measured displacement, shape (N,), metres."""
-        return self.evidence.y
-
-    @property
-    def used(self) -> Mask:
-        """Mask of the samples used in the fit, shape (N,)."""
-        return self.evidence.used
-
-    @property
-    def others(self) -> Mapping[str, FloatArray]:
-        """Displacement of the other axes relative to their start, shape (N,), metres."""
-        return self.evidence.others
-
-    @property
     def target(self) -> FloatArray:
         """Measured displacement minus the contribution of the effects, shape (N,), metres."""
         return self.evidence.y - self.added
@@ -453,12 +422,6 @@ class JointFit:
     def residual(self) -> FloatArray:
         """Residual, measured - predicted, shape (N,), metres."""
         return self.evidence.y - self.predicted
-
-    def of_record(self, k: int) -> "RecordResidual":
-        """Return the signals and the residual of record `k`."""
-        rows, around = self.evidence.slices[k], self.around.records[k]
-        t, u, h, y, residual = (x[rows] for x in (self.t, self.u, self.h, self.y, self.residual))
-        return RecordResidual(t, u, h, y, self.used[rows], residual, around)
 
     def respond(self, u: FloatArray) -> FloatArray:
         """Return the displacement of the hysteresis, shape (N,), metres, for another voltage `u`, shape (N,), volts."""
@@ -565,22 +528,14 @@ class JointFit:
         """Return the effects with the standard deviations of their free parameters."""
         if not self.effects:
             return []
-        spread = self._deviations(self.tangents).tolist()
-        effects = []
-        for effect in self.effects:
-            effects.append(certain(effect, [spread.pop(0) for _ in free(effect)]))
-        return effects
-
-    def _deviations(self, columns: FloatArray) -> FloatArray:
-        """Return the standard deviations, shape (k,), of the gains of columns, shape (N, k), metres."""
         # Errors of neighbouring samples are correlated, so there are fewer independent errors than samples.
-        precision = self.equations.columns(columns, self.before).precision
+        precision = self.equations.columns(self.tangents, self.before).precision
         errors = self.residual[self.evidence.used]
         size = np.sqrt(np.maximum(np.diag(precision), 1e-300))
         inverse = np.linalg.pinv(precision / np.outer(size, size), rcond=1e-12) / np.outer(size, size)
-        variances = np.maximum(np.diag(inverse)[: columns.shape[1]], 0.0)
-        deviations: FloatArray = np.sqrt(variances * np.mean(errors**2) * alike_in_a_row(errors))
-        return deviations
+        variances = np.maximum(np.diag(inverse), 0.0) * np.mean(errors**2) * alike_in_a_row(errors)
+        spread = iter(np.sqrt(variances).tolist())
+        return [certain(effect, [next(spread) for _ in free(effect)]) for effect in self.effects]
 
     def smoothed(self) -> "JointFit":
         """Return the fit with the smoothness of the hysteresis reselected by cross-validation, given the effects."""
@@ -640,28 +595,6 @@ class JointFit:
         """Return the fit with additional `columns`, shape (N, k), metres, whose gains are free."""
         evidence = replace(self.evidence, beside=np.column_stack([self.evidence.beside, columns]))
         return JointFit(evidence, self.effects, self)
-
-
-@dataclass(frozen=True)
-class RecordResidual:
-    """Signals and residual of one record as a `slpi_ros.effects.base.ResidualContext`."""
-
-    t: FloatArray
-    u: FloatArray
-    h: FloatArray
-    y: FloatArray
-    used: Mask
-    residual: FloatArray
-    around: EffectContext
-
-    @property
-    def others(self) -> Mapping[str, FloatArray]:
-        """Displacement of the other axes relative to their start, shape (N,), metres."""
-        return self.around.others
-
-    def respond(self, u: FloatArray) -> FloatArray:
-        """Raise NotImplementedError: effects of a single record do not act on the voltage."""
-        raise NotImplementedError
 
 
 def _behind(effects: Sequence[Effect], h: FloatArray, around: EffectContext) -> FloatArray:

@@ -165,15 +165,6 @@ class Evidence:
         """Rms rounding error of the finest sensor resolution among the records, metres."""
         return float(min(part.digit for part in self.parts) / np.sqrt(12.0))
 
-    def each(self, columns: Sequence[FloatArray]) -> FloatArray:
-        """Return the columns of each record, shape (N_k, m_k) each, extended by zeros in the other records."""
-        whole = np.zeros((self.t.size, sum(own.shape[1] for own in columns)))
-        first = 0
-        for rows, own in zip(self.slices, columns, strict=True):
-            whole[rows, first : first + own.shape[1]] = own
-            first += own.shape[1]
-        return whole
-
     def samples(self, u: FloatArray) -> list[Samples]:
         """Return the samples of each record, after its initial state, for the voltage `u`, shape (N,), volts."""
         low, high = self.basis.grid[[0, -1]] if isinstance(self.basis, SurfaceBasis) else (-np.inf, np.inf)
@@ -246,7 +237,8 @@ def evidence_of(
         )
         for record, (t, samples, others), beginning in zip(records, read, beginnings, strict=True)
     )
-    evidence = Evidence(parts, basis, _smoothness(started, basis))
+    smoothness, *_ = Problem.pose(started, basis).reweighted().best_smoothness(SMOOTHNESS, FIRST_SMOOTHNESS)
+    evidence = Evidence(parts, basis, smoothness)
     residual = _residual(evidence)
     trusted = [
         _trusted(part, residual[rows], samples, only_after_reset=beginning.only_after_reset)
@@ -422,11 +414,6 @@ def _basis(model: AxisModel | None, samples: Sequence[Samples]) -> Basis:
         if basis.grid[0] - margin <= low and high <= basis.grid[-1] + margin:
             return basis
     return SurfaceBasis(np.linspace(low, high, VERTICES))
-
-
-def _smoothness(samples: Sequence[Samples], basis: Basis) -> float:
-    problem = Problem.pose(samples, basis).reweighted()
-    return problem.best_smoothness(SMOOTHNESS, FIRST_SMOOTHNESS)[0]
 
 
 def _outliers(residual: FloatArray, used: Mask) -> Mask:

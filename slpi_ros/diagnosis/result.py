@@ -167,15 +167,15 @@ class Given:
 
     # `hysteresis_rms` and `refitted_rms` are on samples to which the initial state only adds a constant; with the
     # identified effects if the error is then lower.
-    rms: float  # of the model as it is, without the offset of each record
     hysteresis_rms: float  # of its hysteresis
     refitted_rms: float  # of a refitted one
     gain: float  # relative change of the gain of the stage
     gain_deviation: float  # standard deviation
-    zero_moved: float | None  # m, largest among the records; None: small, or due to the initial state
-    motion: float  # m, range of the measured displacement
-    own_rms: float  # at the identification of the model, if these are its records, else 0
-    explained: bool  # whether a new fit leaves little, where the stage seems to have changed
+    rms: float = 0.0  # of the model as it is, without the offset of each record
+    zero_moved: float | None = None  # m, largest among the records; None: small, or due to the initial state
+    motion: float = 0.0  # m, range of the measured displacement
+    own_rms: float = 0.0  # at the identification of the model, if these are its records, else 0
+    explained: bool = True  # whether a new fit leaves little, where the stage seems to have changed
 
     @property
     def changed(self) -> bool:

@@ -7,6 +7,7 @@ from itertools import pairwise
 from typing import Any
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.diagnosis.effect_parameters import EachRecord, free
@@ -37,20 +38,20 @@ def is_own(effect: Effect | type[Any]) -> bool:
 
 
 def seen(now: JointFit) -> FitContext:
-    """Return a joint fit as the plausibility of an effect may see it."""
+    """Return a joint fit as an effect may see it."""
     evidence = now.evidence
 
     def drives() -> list[tuple[float, float]]:
         return [(drive_frequency(evidence.of_record(k)), float(part.t[-1])) for k, part in enumerate(evidence.parts)]
 
     return FitContext(
-        *(now.t, evidence.v, now.u, now.h, now.y, now.used, evidence.rounding, now.effects),
+        *(now.t, evidence.v, now.u, now.h, now.y, now.used, now.residual, now.around, evidence.rounding, now.effects),
+        respond=now.respond,
         excited_frequency=lambda: excited_frequency(evidence),
         drives=drives,
         zeros=lambda: now.zeros,
         first_rise=lambda: now.equations.first_rise,
         left_without=lambda name: now.y - now.prediction_without(name),
-        records=now.around.records,
     )
 
 
@@ -270,21 +271,19 @@ def _bare(candidate: Candidate) -> Candidate:
 
 def _forms(name: str, now: JointFit) -> Iterator[Candidate | Effect]:
     """Yield the forms of an effect: with common parameters, with separate ones in each record, or both."""
-    records, own = len(now.evidence.parts), is_own(EFFECTS[name])
+    context, records, own = seen(now), len(now.evidence.parts), is_own(EFFECTS[name])
     if not own or records == 1:
-        yield from EFFECTS[name].fit(now)
+        yield from EFFECTS[name].fit(context)
     if records == 1 or not (own or EFFECTS[name].sharing == "either"):
         return
-    for forms in zip(*(EFFECTS[name].fit(now.of_record(k)) for k in range(records)), strict=False):
+    for forms in zip(*(EFFECTS[name].fit(context.of_record(k)) for k in range(records)), strict=False):
         parts = [form for form in forms if isinstance(form, Candidate)]
-        yield Candidate(now.evidence.each([part.columns for part in parts]), partial(_each, [*map(_bare, parts)]))  # type: ignore[arg-type]
+        yield Candidate(block_diag(*(part.columns for part in parts)), partial(_each, [*map(_bare, parts)]))
 
 
 def _each(forms: Sequence[Candidate], gains: FloatArray) -> EachRecord | None:
     own = np.split(gains, np.cumsum([form.columns.shape[1] for form in forms[:-1]]))
-    parts = [form.effect(part) for form, part in zip(forms, own, strict=True)]
-    found = tuple(part for part in parts if part is not None)
-    return EachRecord(found) if len(found) == len(parts) else None
+    return EachRecord.of([form.effect(part) for form, part in zip(forms, own, strict=True)])
 
 
 class Search:

@@ -1,10 +1,12 @@
 """The `Effect` protocol with the facts of an effect, its context, and the candidates and views of a fit."""
 
+import re
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import wraps
+from functools import partial, wraps
 from math import inf
-from typing import Any, ClassVar, Literal, NamedTuple, Protocol, Self, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,6 +89,11 @@ class EffectContext:
             np.split(signal, np.cumsum([record.t.size for record in self.records[:-1]])) if self.records else [signal]
         )
 
+    def each(self, of: Callable[..., FloatArray], *signals: FloatArray) -> FloatArray:
+        """Return what `of` returns for each record, of its parts of the signals and its context, concatenated."""
+        parts = zip(*map(self.split, signals), self.records or (self,), strict=True)
+        return np.concatenate([of(*each) for each in parts])
+
 
 class Followed(NamedTuple):
     """A recorded quantity that an effect follows: name, reference value, and recorded range, in its unit."""
@@ -131,39 +138,39 @@ def by_record(
 
     @wraps(apply)
     def applied(effect: Effected, signal: FloatArray, around: EffectContext) -> FloatArray:
-        if not around.records:
-            return apply(effect, signal, around)
-        parts = zip(around.split(signal), around.records, strict=True)
-        return np.concatenate([apply(effect, part, record) for part, record in parts])
+        return around.each(partial(apply, effect), signal) if around.records else apply(effect, signal, around)
 
     return applied
 
 
-class Streaming(Protocol):
-    """Streaming (sample by sample) evaluation of an effect, including its state."""
+class Streaming:
+    """Streaming (sample by sample) evaluation of an effect, including its state; by default there is none."""
 
     def start(self, x: float) -> None:
         """Initialise the state to equilibrium at the constant input `x` (V or m)."""
 
     def forward(self, dt: float, x: float) -> float:
         """Advance the state by `dt` (s) to the input `x` and return the output: what the hysteresis feels, or m."""
+        raise NotImplementedError
 
     def resume(self, other: Any, x: float) -> None:
-        """Continue from the state of the same effect of another model, at the input `x` (V or m)."""
+        """Continue from the state of the same effect of another model, at the input `x` (V or m); by default do not."""
 
     def snapshot(self) -> Any:
         """Return the complete state as JSON-compatible numbers and tuples of numbers."""
+        return ()
 
     def restore(self, state: Any) -> None:
         """Replace the state by one returned by `snapshot`."""
 
 
-class StreamingEffect(Streaming, Protocol):
+class StreamingEffect(Streaming):
     """Streaming evaluation of an effect on the voltage or on the displacement."""
 
     @property
     def relaxing(self) -> tuple[float, ...]:
         """Distances from equilibrium (m) that outlast a restart of the process; of most effects none."""
+        return ()
 
     def relax_from(self, distances: Sequence[float]) -> None:
         """Continue from distances as `relaxing` returned them; others are ignored."""
@@ -176,65 +183,46 @@ class StreamingEffect(Streaming, Protocol):
 
     def inverse(self, dt: float, wanted: float) -> float:
         """Return the input, or a stable approximation, for the output `wanted` after `dt` (s); keep the state."""
+        raise NotImplementedError
 
 
-class StreamingAround(Streaming, Protocol):
+class StreamingAround(Streaming):
     """Streaming evaluation of an effect around the hysteresis: what the hysteresis feels, and what goes beside it."""
 
     def inverse(self, dt: float, wanted: float, memory: Memory, lower: float, upper: float) -> float:
         """Return the voltage (V) for the displacement `wanted` (m); `memory` moves, within `lower` and `upper` (V)."""
+        raise NotImplementedError
 
     @property
     def applied(self) -> float:
         """Applied voltage (V), of which the hysteresis feels another."""
+        raise NotImplementedError
 
     @property
     def beside(self) -> float:
         """Displacement (m) beside that of the hysteresis."""
+        raise NotImplementedError
 
     def undo(self, state: Any) -> None:
         """Go back to `snapshot`, for the same sample once more."""
+        raise NotImplementedError
 
 
-class StreamingBase:
-    """What streaming effects do unless they say otherwise: they have no state."""
+@dataclass(frozen=True)
+class Effect(ABC):
+    """One effect: a frozen dataclass whose fields are its parameters (`parameter`), in SI units, and `uncertainty`.
 
-    @property
-    def relaxing(self) -> tuple[float, ...]:
-        """Return nothing."""
-        return ()
+    It says what it is and does in `apply`, `fit` and `describe`; all else is as here unless it says otherwise.
+    """
 
-    def relax_from(self, distances: Sequence[float]) -> None:
-        """Do nothing."""
-
-    def start(self, x: float) -> None:
-        """Do nothing."""
-
-    def reach(self, voltage: float) -> None:
-        """Do nothing."""
-
-    def surround(self, key: str, value: float) -> None:
-        """Do nothing."""
-
-    def snapshot(self) -> Any:
-        """Return nothing."""
-        return ()
-
-    def restore(self, state: Any) -> None:
-        """Do nothing."""
-
-    def resume(self, other: Any, x: float) -> None:
-        """Keep the state: this effect does not continue from that of another model."""
-
-
-class EffectBase(Protocol):
-    """Facts of an effect, and what effects do unless they say otherwise."""
-
-    @property
-    def name(self) -> str:
-        """Name of the effect."""
-
+    name: ClassVar[str]
     side: ClassVar[Side]
+    acts_on: ClassVar[Signal] = "displacement"
+    # For the documentation: what it is, and whether it is compensated.
+    what: ClassVar[str]
+    compensated: ClassVar[str]
+    # The drive that separates it from other effects.
+    excitation: ClassVar[Excitation]
     # Whether only feedback undoes it, because it follows time and not the voltage, or comes before the voltage.
     needs_feedback: ClassVar[bool] = False
     # Whether the inverse of a whole path is better than that sample by sample, as it looks ahead.
@@ -251,6 +239,33 @@ class EffectBase(Protocol):
     changes_gain: ClassVar[bool] = False
     # Whether it follows recorded quantities.
     follows_quantities: ClassVar[bool] = False
+
+    # Standard deviation by place, such as ``gains.y`` or ``modes.0.gain``, in the unit of the parameter.
+    uncertainty: Mapping[str, float] = field(default_factory=dict, kw_only=True)
+
+    @abstractmethod
+    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
+        """Return the output of the effect for an input signal, shape (N,), volts or metres, starting at equilibrium."""
+
+    @classmethod
+    @abstractmethod
+    def fit(cls, context: "FitContext") -> "Iterator[Candidate | Effect]":
+        """Yield candidates for a fit: forms that are linear in their gains, or effects with fixed parameters."""
+
+    def column(self, context: "FitContext") -> FloatArray:
+        """Return by how much the displacement in a fit would change with it, shape (N,), metres."""
+        if self.acts_on == "displacement":
+            return self.apply(context.h, context.around) - context.h
+        return context.respond(self.apply(context.u, context.around)) - context.h
+
+    @abstractmethod
+    def describe(self) -> str:
+        """Describe the effect with its parameter values in one sentence."""
+
+    def __init_subclass__(cls) -> None:
+        """Name an effect after its class, unless it says otherwise: `RateDependence` is ``rate_dependence``."""
+        if "name" not in vars(cls):
+            cls.name = re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__).lower()
 
     def __post_init__(self) -> None:
         require_facts(self)
@@ -304,7 +319,7 @@ class EffectBase(Protocol):
             value = getattr(self, name)
             new = [next(left) if leaf.free else leaf.value for leaf in leaves(name, facts, value)]
             changed[name] = with_leaves(value, iter(new))
-        return replace(self, **self.limited(changed))  # type: ignore[type-var]
+        return replace(self, **self.limited(changed))
 
     @classmethod
     def limited(cls, changed: dict[str, Any]) -> dict[str, Any]:
@@ -323,7 +338,7 @@ class EffectBase(Protocol):
         """Return the effect for a zero of the displacement that has moved by `by` (m)."""
         if "origin" not in facts_of(type(self)):
             return self
-        return replace(self, origin=self.origin + by)  # type: ignore[attr-defined, type-var]
+        return replace(self, origin=self.origin + by)  # type: ignore[attr-defined, call-arg]
 
     def streaming(self) -> Any:
         """Return the `StreamingEffect` or `StreamingAround`; None if it is not compensated sample by sample."""
@@ -345,10 +360,14 @@ class EffectBase(Protocol):
                 streaming.forward(sample[0], whole[-1])
         return np.array(whole)
 
+    def beside(self, v: FloatArray, u: FloatArray) -> FloatArray:
+        """Return the displacement (m) beside the hysteresis for applied and felt voltages (V), shape (N,) each."""
+        return np.zeros_like(v)
+
     @property
     def lasting(self) -> "Effect | None":
         """The effect as it is after its record; None if it ends with it."""
-        return None if self.side == "record" else self  # type: ignore[return-value]
+        return None if self.side == "record" else self
 
     @property
     def without_records(self) -> Self:
@@ -362,7 +381,7 @@ class EffectBase(Protocol):
 
     def of_record(self, k: int) -> "Effect":
         """Return the effect as it is on the record of number `k` of those that it was fitted to."""
-        return self  # type: ignore[return-value]
+        return self
 
     @property
     def passes(self) -> tuple[float, float]:
@@ -396,7 +415,7 @@ class EffectBase(Protocol):
 
     def detuned(self, scales: Sequence[float], uncertain: float) -> "Effect":
         """Return it with the frequencies of `ringing` scaled, and dampings less by so many standard uncertainties."""
-        return self  # type: ignore[return-value]
+        return self
 
     @property
     def steepest(self) -> float:
@@ -432,41 +451,10 @@ class EffectBase(Protocol):
         return {}
 
 
-class Effect(EffectBase, Protocol):
-    """One effect: a frozen dataclass whose fields are its parameters (`parameter`), in SI units, and `uncertainty`."""
-
-    name: ClassVar[str]
-    # For the documentation: what it is, and whether it is compensated.
-    what: ClassVar[str]
-    compensated: ClassVar[str]
-    # The drive that separates it from other effects.
-    excitation: ClassVar[Excitation]
-
-    @property
-    def acts_on(self) -> Signal:
-        """Signal on which the effect acts: the voltage, the hysteresis, or the displacement."""
-
-    @property
-    def uncertainty(self) -> Mapping[str, float]:
-        """Standard deviation by place, such as ``gains.y`` or ``modes.0.gain``, in the unit of the parameter."""
-
-    def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the output of the effect for an input signal, shape (N,), volts or metres, starting at equilibrium."""
-
-    def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
-        """Return the input signal for an output signal, shape (N,), volts or metres."""
-
-    @classmethod
-    def fit(cls, context: "ResidualContext") -> "Iterator[Candidate | Effect]":
-        """Yield candidates for a fit: forms that are linear in their gains, or effects with fixed parameters."""
-
-    def describe(self) -> str:
-        """Describe the effect with its parameter values in one sentence."""
-
-
-class Additive(EffectBase, Protocol):
+class Additive(Effect):
     """An effect that adds a displacement, whatever the signal is."""
 
+    @abstractmethod
     def added(self, around: EffectContext) -> FloatArray:
         """Return the displacement that it adds, shape (N,), metres."""
 
@@ -479,112 +467,65 @@ class Additive(EffectBase, Protocol):
         return signal - self.added(around)
 
 
-class AroundHysteresis(Effect, Protocol):
-    """An effect around the hysteresis: its `apply` returns the voltage that the hysteresis feels."""
-
-    def beside(self, v: FloatArray, u: FloatArray) -> FloatArray:
-        """Return the displacement (m) beside the hysteresis for applied and felt voltages (V), shape (N,) each."""
-
-
 @dataclass(frozen=True)
 class Candidate:
     """One form of an effect for the identification, linear in its gains."""
 
-    # Contribution to the displacement (m) for a unit value of each of the k gains, shape (N, k).
+    # Contribution to the displacement (m) for a unit value of each of the k gains, shape (N, k): of the initial states
+    # of the records first, each of which belongs to one record, then of the effect.
     columns: FloatArray
     # Returns the effect for gains of shape (k,), or None if the gains are not admissible.
     effect: Callable[[FloatArray], Effect | None]
     # Number of trailing columns whose gains must be non-negative; if not 0, `effect` receives only these gains.
     positive: int = 0
-    # Number of leading columns that describe the initial state of the records; each belongs to one record.
-    starting: int = 0
     # Forms of different groups are refined each by itself, as they lead to different parameters.
     group: int = 0
 
 
-class ResidualContext(Protocol):
-    """The hysteresis and effects identified so far, and the residual of a record of N samples."""
-
-    @property
-    def t(self) -> FloatArray:
-        """Time, shape (N,), seconds."""
-
-    @property
-    def u(self) -> FloatArray:
-        """Voltage that drives the hysteresis, shape (N,), volts."""
-
-    @property
-    def h(self) -> FloatArray:
-        """Displacement of the hysteresis, shape (N,), metres."""
-
-    @property
-    def y(self) -> FloatArray:
-        """Measured displacement, shape (N,), metres."""
-
-    @property
-    def used(self) -> Mask:
-        """Mask of the samples used in the fit, shape (N,)."""
-
-    @property
-    def residual(self) -> FloatArray:
-        """Residual, measured - model, shape (N,), metres."""
-
-    @property
-    def others(self) -> Mapping[str, FloatArray]:
-        """Displacement of the other axes relative to their start, shape (N,), metres."""
-
-    @property
-    def around(self) -> EffectContext:
-        """Context passed to the effects."""
-
-    def respond(self, u: FloatArray) -> FloatArray:
-        """Return the displacement of the hysteresis, shape (N,), metres, for the voltage `u`, shape (N,), volts."""
-
-
 @dataclass(frozen=True)
 class FitContext:
-    """A fit and its records as the plausibility of an effect may see them; signals of all records, shape (N,)."""
+    """A fit and its records as the candidates and the plausibility of an effect see them; signals, shape (N,)."""
 
-    # Time from the start of each record (s), applied and felt voltage (V), displacement of the hysteresis and measured
-    # displacement (m).
+    # Time from the start of each record (s), applied and felt voltage (V), displacement of the hysteresis, measured
+    # displacement, and residual, measured - model (m).
     t: FloatArray
     v: FloatArray
     u: FloatArray
     h: FloatArray
     y: FloatArray
     used: Mask
+    residual: FloatArray
+    around: EffectContext
     # Rms rounding error of the sensor (m).
     rounding: float
     effects: Sequence[Effect]
-    # Return the highest frequency (Hz) that any record excites; of each record the single drive frequency (Hz), 0 if
-    # there are several, and the duration (s); the displacement (m) at the centre of the largest loop of each record;
-    # the mask of the samples, (N,), on the way to the largest displacement so far, which happens once; and what would
-    # be left (m) without the effect of a name, everything else unchanged.
+    # Return the displacement of the hysteresis (m) for another felt voltage (V), (N,) each; the highest frequency (Hz)
+    # that any record excites; of each record the single drive frequency (Hz), 0 if there are several, and the duration
+    # (s); the displacement (m) at the centre of the largest loop of each record; the mask of the samples, (N,), on the
+    # way to the largest displacement so far, which happens once; and what would be left (m) without the effect of a
+    # name, everything else unchanged.
+    respond: Callable[[FloatArray], FloatArray]
     excited_frequency: Callable[[], float]
     drives: Callable[[], Sequence[tuple[float, float]]]
     zeros: Callable[[], FloatArray]
     first_rise: Callable[[], Mask]
     left_without: Callable[[str], FloatArray]
-    # Contexts of the records that the signals are concatenated from; empty for a single record.
-    records: tuple[EffectContext, ...] = ()
 
     def of_record(self, k: int) -> "FitContext":
-        """Return what concerns record `k`."""
-        if not self.records:
+        """Return what concerns record `k`, of which no other voltage is felt."""
+        if not self.around.records:
             return self
-        first = sum(record.t.size for record in self.records[:k])
-        own = slice(first, first + self.records[k].t.size)
-        t, v, u, h, y = (x[own] for x in (self.t, self.v, self.u, self.h, self.y))
-        drives, zeros, rise = (
-            (lambda: [self.drives()[k]]), (lambda: self.zeros()[k : k + 1]), (lambda: self.first_rise()[own])
-        )  # fmt: skip
-        effects, excited = self.effects, self.excited_frequency
-
-        def left_without(name: str) -> FloatArray:
-            return self.left_without(name)[own]
-
-        return FitContext(
-            *(t, v, u, h, y, self.used[own], self.rounding, effects), excited, drives, zeros, rise, left_without
+        first = sum(record.t.size for record in self.around.records[:k])
+        own = slice(first, first + self.around.records[k].t.size)
+        signals = {name: getattr(self, name)[own] for name in ("t", "v", "u", "h", "y", "used", "residual")}
+        return replace(
+            self,
+            around=self.around.records[k],
+            drives=lambda: [self.drives()[k]],
+            zeros=lambda: self.zeros()[k : k + 1],
+            first_rise=lambda: self.first_rise()[own],
+            left_without=lambda name: self.left_without(name)[own],
+            **signals,
         )
 
     @property
@@ -595,9 +536,7 @@ class FitContext:
     @property
     def fastest(self) -> float:
         """Fastest rate of the voltage in any record (V/s), without jumps."""
-        if not self.records:
-            return fastest(self.t, self.v)
-        return max(self.of_record(k).fastest for k in range(len(self.records)))
+        return max(fastest(*parts) for parts in zip(self.around.split(self.t), self.around.split(self.v), strict=True))
 
     @property
     def motion(self) -> float:
@@ -622,13 +561,10 @@ def longest(around: EffectContext) -> float:
 
 def decays(time_constants: Sequence[float], around: EffectContext) -> FloatArray:
     """Return what is left of 1 at the start of each record for each time constant (s), shape (N, k), by record."""
-    times = around.split(around.t)
-    whole = np.zeros((around.t.size, len(times) * len(time_constants)))
-    columns = iter(whole.T)
-    for rows, t in zip(around.split(np.arange(around.t.size)), times, strict=True):
-        for tau in time_constants:
-            next(columns)[rows] = np.exp(-(t - t[:1]) / tau)
-    return whole
+    from scipy.linalg import block_diag
+
+    parts = [np.exp(-(t - t[:1])[:, None] / np.array(time_constants)) for t in around.split(around.t)]
+    return np.asarray(block_diag(*parts))
 
 
 def is_course(*records: Sequence[float]) -> bool:
@@ -666,7 +602,7 @@ def strongest_lines(
     return found
 
 
-def rhythms(context: ResidualContext, count: int, lowest: float) -> list[float]:
+def rhythms(context: FitContext, count: int, lowest: float) -> list[float]:
     """Return the strongest frequencies (Hz) in the residual, at or above `lowest` (Hz)."""
     from scipy.fft import next_fast_len
 

@@ -2,12 +2,11 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import cast
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import AroundHysteresis, Effect, EffectContext
+from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.effects.registry import in_order
 
 
@@ -16,7 +15,7 @@ class Chain:
     """The effects of one axis, in the order in which they act."""
 
     before: tuple[Effect, ...]  # on the voltage
-    around: AroundHysteresis | None  # the hysteresis
+    around: Effect | None  # the hysteresis
     own: tuple[Effect, ...]  # on the displacement of the axis itself
     shared: tuple[Effect, ...]  # coupling to other axes, and what follows it
     measured: tuple[Effect, ...] = ()  # of sensor and record, which no inverse for the stage contains
@@ -31,7 +30,7 @@ class Chain:
         around = [effect for effect in inside if effect.acts_on == "hysteresis"]
         return cls(
             tuple(effect for effect in inside if effect.acts_on == "voltage"),
-            cast(AroundHysteresis, around[0]) if around else None,
+            around[0] if around else None,
             tuple(behind[:coupled]),
             tuple(behind[coupled:]),
             tuple(effect for effect in ordered if effect.side != "stage"),

@@ -1,13 +1,12 @@
 """Clock: the displacement's stamps are of another clock than the voltage's."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import ClassVar
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import Candidate, EffectBase, EffectContext, ResidualContext, Side, Signal
+from slpi_ros.effects.base import Candidate, Effect, EffectContext, FitContext, by_record
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, Scales, parameter
 
@@ -28,15 +27,13 @@ def _small(value: float, scales: Scales) -> float:
 
 
 @dataclass(frozen=True)
-class Clock(EffectBase):
+class Clock(Effect):
     """Stamps ``(1 + rate) t`` of the displacement at the time ``t`` from the record's start."""
 
-    name: ClassVar[str] = "clock"
-    acts_on: ClassVar[Signal] = "displacement"
-    side: ClassVar[Side] = "record"
-    what: ClassVar[str] = "the clock of the displacement's stamps goes faster or slower than that of the voltage's"
-    compensated: ClassVar[str] = "no, it is of the record's stamps"
-    excitation: ClassVar[Excitation] = Excitation(
+    side = "record"
+    what = "the clock of the displacement's stamps goes faster or slower than that of the voltage's"
+    compensated = "no, it is of the record's stamps"
+    excitation = Excitation(
         "The same full loop over and over, as quick as allowed: the shift between voltage and displacement grows from "
         "the first loop to the last, where a delay or a lag shifts all of them alike.",
         _draw,
@@ -46,36 +43,30 @@ class Clock(EffectBase):
 
     rate: float = parameter(
         "", "by how much the displacement's clock goes faster, relative: 1e-6 is 1 ppm", -0.1, 0.1,
-        fit=Fit("linear", _small, size=True),
+        fit=Fit("linear", _small),
     )  # fmt: skip
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
+    @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return what is read at the stamps, shape (N,), metres."""
         return self._at(1 / (1 + self.rate), signal, around)
 
+    @by_record
     def invert(self, signal: FloatArray, around: EffectContext) -> FloatArray:
         """Return the displacement at times by the voltage's clock, shape (N,), metres."""
         return self._at(1 + self.rate, signal, around)
 
     def _at(self, scale: float, signal: FloatArray, around: EffectContext) -> FloatArray:
-        parts = zip(around.split(signal), around.split(around.t), strict=True)
-        return np.concatenate([
-            np.interp(t[:1] + scale * (t - t[:1]), t, part) if part.size else part for part, t in parts
-        ])  # fmt: skip
+        return np.interp(around.t[:1] + scale * around.since, around.t, signal) if signal.size else signal
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield the time derivative of the displacement, times the time from the record's start."""
         if not float(np.ptp(context.t)) >= SHORTEST:
             return
         seen = np.where(context.used, context.y - context.residual, context.h)
         column = (cls(STEP).apply(seen, context.around) - seen) / STEP
-        yield Candidate(column[:, None], cls._of)
-
-    @classmethod
-    def _of(cls, gains: FloatArray) -> "Clock":
-        return cls(float(gains[0]))
+        yield Candidate(column[:, None], lambda gains: cls(float(gains[0])))
 
     def describe(self) -> str:
         """Describe the rate."""

@@ -1,23 +1,14 @@
 """Contact: from a displacement on the stage works against something, such as a stop or a sample."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar, Self
+from typing import Self
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import (
-    Candidate,
-    EffectBase,
-    EffectContext,
-    FitContext,
-    ResidualContext,
-    Side,
-    Signal,
-    StreamingBase,
-)
+from slpi_ros.effects.base import Candidate, Effect, EffectContext, FitContext, StreamingEffect
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining
 from slpi_ros.effects.parameters import Fit, parameter
 
@@ -38,15 +29,13 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 
 @dataclass(frozen=True)
-class Contact(EffectBase):
+class Contact(Effect):
     """A change of the slope at one displacement, ``y = x + (gain - 1) max(x - position, 0)``."""
 
-    name: ClassVar[str] = "contact"
-    acts_on: ClassVar[Signal] = "displacement"
-    side: ClassVar[Side] = "stage"
-    what: ClassVar[str] = "from a displacement on the stage works against something: a stop, a sample, a cable"
-    compensated: ClassVar[str] = "exactly"
-    excitation: ClassVar[Excitation] = Excitation(
+    side = "stage"
+    what = "from a displacement on the stage works against something: a stop, a sample, a cable"
+    compensated = "exactly"
+    excitation = Excitation(
         "Loops of one small size at five levels, then turns from four heights: the slope changes at one displacement "
         "whatever came before, where that of a hysteresis depends on where the motion began.",
         _draw,
@@ -58,7 +47,6 @@ class Contact(EffectBase):
     gain: float = parameter(
         "", "slope beyond it over the slope before", 0, 1e3, above=True, fit=Fit("linear", 1e-5, LEAST_GAIN)
     )
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def plausible(self, context: FitContext) -> bool:
         """Return whether the stage is again and again on either side of the position."""
@@ -81,7 +69,7 @@ class Contact(EffectBase):
         return np.where(signal > self.position, beyond, signal)
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield positions over the range of the displacement."""
         places = np.linspace(float(context.h.min()), float(context.h.max()), POSITIONS + 2)[1:-1]
         for position in places.tolist():
@@ -111,7 +99,7 @@ class Contact(EffectBase):
         return StreamingContact(self.position, self.gain)
 
 
-class StreamingContact(StreamingBase):
+class StreamingContact(StreamingEffect):
     """Streaming (sample by sample) contact, without state."""
 
     def __init__(self, position: float, gain: float) -> None:

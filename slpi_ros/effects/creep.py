@@ -1,23 +1,20 @@
 """Creep: slow relaxation of the displacement after a move."""
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from math import gamma, inf, isinf, log
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.effects.base import (
     Candidate,
-    EffectBase,
+    Effect,
     EffectContext,
     FitContext,
-    ResidualContext,
-    Side,
-    Signal,
-    StreamingBase,
+    StreamingEffect,
     Unsure,
     by_record,
     longest,
@@ -58,21 +55,19 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 
 @dataclass(frozen=True)
-class Creep(EffectBase):
+class Creep(Effect):
     """Parallel relaxations, ``y = h + sum_k g_k z_k``, ``tau_k dz_k/dt = (h - h_0) - z_k``, at first in equilibrium.
 
     They are given each by itself, or by a power of time: a step creeps on by the share ``gain (t / 1 s)^exponent``.
     """
 
     # ``h_0``, the `origin`, is where creep adds nothing; in a fit, where there is none, the first one of each record.
-    name: ClassVar[str] = "creep"
-    acts_on: ClassVar[Signal] = "displacement"
-    side: ClassVar[Side] = "stage"
-    is_filter: ClassVar[bool] = True
-    what: ClassVar[str] = "slow relaxation after each movement, from 0.1 s on"
-    compensated: ClassVar[str] = "yes"
-    dynamic: ClassVar[bool] = True
-    excitation: ClassVar[Excitation] = Excitation(
+    side = "stage"
+    is_filter = True
+    what = "slow relaxation after each movement, from 0.1 s on"
+    compensated = "yes"
+    dynamic = True
+    excitation = Excitation(
         "Quick moves up and down, each followed by a hold, the later ones longer: at constant voltage hysteresis, "
         "lag and delay are still, and only creep goes on, in proportion to the move and in its direction.",
         _draw,
@@ -107,7 +102,6 @@ class Creep(EffectBase):
         "", "share of a step that has followed after 1 s by the power of time", 0, 1, default=0.0, instead="gains",
         fit=Fit("linear", 1e-5, 0.0, LARGEST_POWER, stays=0.0),
     )  # fmt: skip
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -161,33 +155,31 @@ class Creep(EffectBase):
         return signal + crept
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield single relaxations from fast to slow, and combinations of several."""
-        step, most = usual_step(context.t), longest(context.around)
+        step, most, at = usual_step(context.t), longest(context.around), (context.around, context.used)
         shortest = max(10 * step, FASTEST)
         if shortest < 0.5 * most:
             single = [np.array([tau]) for tau in np.geomspace(shortest, 0.5 * most, SINGLE)]
             several = [np.geomspace(shortest, share * most, count) for count, share in SEVERAL]
             for taus in (*single, *several):
-                starting = _settling(taus.tolist(), context.around, context.used)
-                columns = np.column_stack([starting, *cls._creeping(taus, context)])
-                yield Candidate(columns, partial(cls._each, taus), taus.size, starting.shape[1])
+                columns = np.column_stack([_settling(taus.tolist(), *at), *cls._creeping(taus, context)])
+                yield Candidate(columns, partial(cls._each, taus), taus.size)
             for exponent in POWERS:
                 unit = cls(exponent=exponent, gain=1.0)
-                starting = unit.starting(context.around, context.used)
-                columns = np.column_stack([starting, unit.apply(context.h, context.around) - context.h])
-                yield Candidate(columns, partial(cls._of_power, exponent), 1, starting.shape[1], group=1)
+                columns = np.column_stack([unit.starting(*at), unit.column(context)])
+                yield Candidate(columns, partial(cls._of_power, exponent), 1, group=1)
         for slow in LAW_TO:
             first, last = max(FASTEST, LAW_SAMPLES * step), slow * most
             if last > 10 * first:
                 taus = np.geomspace(first, last, max(LAW_FEWEST, 1 + round(LAW_PER_DECADE * np.log10(last / first))))
-                starting = _settling(taus.tolist(), context.around, context.used)
-                columns = np.column_stack([starting, np.sum(cls._creeping(taus, context), axis=0)])
-                yield Candidate(columns, partial(cls._law, taus), 1, starting.shape[1])
+                together = np.sum(cls._creeping(taus, context), axis=0)
+                columns = np.column_stack([_settling(taus.tolist(), *at), together])
+                yield Candidate(columns, partial(cls._law, taus), 1)
 
     @classmethod
-    def _creeping(cls, taus: FloatArray, context: ResidualContext) -> list[FloatArray]:
-        return [cls((tau,), (1.0,)).apply(context.h, context.around) - context.h for tau in taus.tolist()]
+    def _creeping(cls, taus: FloatArray, context: FitContext) -> list[FloatArray]:
+        return [cls((tau,), (1.0,)).column(context) for tau in taus.tolist()]
 
     @classmethod
     def _of_power(cls, exponent: float, gains: FloatArray) -> "Creep | None":
@@ -287,7 +279,7 @@ class Creep(EffectBase):
         return [hold(dt, tau) for tau in self.chain[0].tolist()]
 
 
-class StreamingCreep(StreamingBase):
+class StreamingCreep(StreamingEffect):
     """Streaming (sample by sample) creep."""
 
     def __init__(self, creep: Creep) -> None:
@@ -394,22 +386,20 @@ def _settling(
 ) -> FloatArray:
     """Return the decay of creep that began before each record, shape (N, k), one column per identifiable relaxation."""
     # A law, logarithmic or with the `gains` of a power of time, has a single column, for a move just before the record.
-    whole = []
-    for own in range(max(len(around.records), 1)):
-        for column in _settling_of(time_constants, around.split(around.t)[own], around.split(used)[own], gains):
-            parts = [np.zeros_like(t) for t in around.split(around.t)]
-            parts[own] = column
-            whole.append(np.concatenate(parts))
-    return np.column_stack([np.empty((around.t.size, 0)), *whole])
+    from scipy.linalg import block_diag
+
+    parts = zip(around.split(around.t), around.split(used), strict=True)
+    return np.asarray(block_diag(*(_settling_of(time_constants, t, own, gains) for t, own in parts)))
 
 
 def _settling_of(
     time_constants: Sequence[float] | FloatArray, t: FloatArray, used: Mask, gains: FloatArray | None
-) -> list[FloatArray]:
+) -> FloatArray:
     times = t[used]
     since = np.maximum(t - times[0], 0.0)
     if len(time_constants) >= LAW_FEWEST:
         shares, rest = (np.ones(len(time_constants)), 0.0) if gains is None else (gains, float(np.sum(gains)))
         each = zip(time_constants, shares, strict=True)
-        return [np.sum([share * np.exp(-since / tau) for tau, share in each], axis=0) - rest]
-    return [np.exp(-since / tau) for tau in time_constants if tau < SOON_SETTLED * (times[-1] - times[0])]
+        return np.asarray(np.sum([share * np.exp(-since / tau) for tau, share in each], axis=0) - rest)[:, None]
+    soon = [tau for tau in time_constants if tau < SOON_SETTLED * (times[-1] - times[0])]
+    return np.asarray(np.exp(-since[:, None] / np.array(soon)))

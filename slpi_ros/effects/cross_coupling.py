@@ -1,14 +1,12 @@
 """Cross coupling: displacement of an axis caused by the motion of other axes."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from functools import partial
-from typing import ClassVar
+from dataclasses import dataclass
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import Additive, Candidate, EffectContext, ResidualContext, Side, Signal
+from slpi_ros.effects.base import Additive, Candidate, EffectContext, FitContext
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining
 from slpi_ros.effects.parameters import Fit, parameter, require
 
@@ -27,12 +25,10 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 class CrossCoupling(Additive):
     """Linear coupling, ``y = x + sum_j gain_j m_j``, with ``m_j`` the motion of axis j; the stage model inverts it."""
 
-    name: ClassVar[str] = "cross_coupling"
-    acts_on: ClassVar[Signal] = "displacement"
-    side: ClassVar[Side] = "stage"
-    what: ClassVar[str] = "part of the movement of another axis"
-    compensated: ClassVar[str] = "if both axes are in one node"
-    excitation: ClassVar[Excitation] = Excitation(
+    side = "stage"
+    what = "part of the movement of another axis"
+    compensated = "if both axes are in one node"
+    excitation = Excitation(
         "One axis moves while all others rest: what a resting axis shows then is coupling, and neither its own "
         "hysteresis nor its own dynamics.",
         _draw,
@@ -43,7 +39,6 @@ class CrossCoupling(Additive):
         "", "metres for one metre of another axis, by its name", -1, 1, count=(1, 100),
         fit=Fit("linear", 1e-5, most=0.4),
     )  # fmt: skip
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -56,14 +51,11 @@ class CrossCoupling(Additive):
         return sum(known, np.zeros_like(around.t))
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield a candidate with the motion of all other axes."""
-        if context.others:
-            yield Candidate(np.column_stack(list(context.others.values())), partial(cls._of, tuple(context.others)))
-
-    @classmethod
-    def _of(cls, axes: tuple[str, ...], gains: FloatArray) -> "CrossCoupling":
-        return cls(dict(zip(axes, gains.tolist(), strict=True)))
+        if others := context.around.others:
+            columns = np.column_stack(list(others.values()))
+            yield Candidate(columns, lambda gains: cls(dict(zip(others, gains.tolist(), strict=True))))
 
     @property
     def coupling(self) -> Mapping[str, float]:

@@ -118,7 +118,7 @@ class Mode:
     damping: float = parameter("", "damping ratio", 1e-6, 2, fit=Fit("relative", least=1e-3, most=2.0, stays=2.0))
     gain: float = parameter(
         "", "share of the static displacement; at most 1 in sum", 0, 1, default=1.0, required=True,
-        fit=Fit("linear", 1e-5, LEAST_GAIN, 1.0, size=True, stays=1.0),
+        fit=Fit("linear", 1e-5, LEAST_GAIN, 1.0, stays=1.0),
     )  # fmt: skip
 
     @cached_property

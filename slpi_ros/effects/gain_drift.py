@@ -1,25 +1,13 @@
 """Gain drift: slow change of the sensitivity of the stage."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import (
-    Candidate,
-    EffectBase,
-    EffectContext,
-    FitContext,
-    ResidualContext,
-    Sharing,
-    Side,
-    Signal,
-    StreamingBase,
-    Unsure,
-)
+from slpi_ros.effects.base import Candidate, Effect, EffectContext, FitContext, StreamingEffect, Unsure
 from slpi_ros.effects.excitation import Excitation, full_loops
 from slpi_ros.effects.parameters import Fit, parameter, require
 
@@ -33,21 +21,19 @@ LARGEST, TAKES = 0.3, 10.0
 
 
 @dataclass(frozen=True)
-class GainDrift(EffectBase):
+class GainDrift(Effect):
     """A time-dependent factor on the displacement, ``y = origin + (1 + g(t)) (x - origin)``."""
 
     # ``g`` is 0 at the record's start, linear between knots, and constant after the last knot. The knots belong to the
     # record; after it the sensitivity stays at its last value, see `lasting`. The factor scales hysteresis, creep and
     # resonance, and acts before the cross coupling, so that other axes receive the scaled motion.
-    name: ClassVar[str] = "gain_drift"
-    acts_on: ClassVar[Signal] = "displacement"
-    side: ClassVar[Side] = "stage"
-    what: ClassVar[str] = "the sensitivity changes slowly"
-    compensated: ClassVar[str] = "as it was at the end of the record; its course belongs to the record"
-    needs_feedback: ClassVar[bool] = True
-    sharing: ClassVar[Sharing] = "separate"
-    changes_gain: ClassVar[bool] = True
-    excitation: ClassVar[Excitation] = Excitation(
+    side = "stage"
+    what = "the sensitivity changes slowly"
+    compensated = "as it was at the end of the record; its course belongs to the record"
+    needs_feedback = True
+    sharing = "separate"
+    changes_gain = True
+    excitation = Excitation(
         "Full loops one after the other, all alike and without a rest: voltage, memory and creep repeat, so a "
         "stroke that grows or shrinks is the sensitivity, where a drift moves both ends of each loop by the same "
         "(give it several minutes, or start after a rest).",
@@ -64,7 +50,6 @@ class GainDrift(EffectBase):
         "m", "displacement that does not change with the sensitivity", -1e3, 1e3,
         fit=Fit("linear", 1e-9, near_motion=True),
     )  # fmt: skip
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -112,7 +97,7 @@ class GainDrift(EffectBase):
         return self.origin + (signal - self.origin) / self.factor(around.t)
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield a straight line, and piecewise linear curves with uniform knots and additional early knots."""
         # Displacement shifts at the same knots are fitted with the gains; their ratio gives the origin.
         t, end = context.t - context.t[0], float(context.t[-1] - context.t[0])
@@ -167,7 +152,7 @@ class GainDrift(EffectBase):
         return StreamingGainDrift(self.origin, 1.0 + self.gains[-1])
 
 
-class StreamingGainDrift(StreamingBase):
+class StreamingGainDrift(StreamingEffect):
     """Streaming (sample by sample) constant sensitivity factor, without state."""
 
     def __init__(self, origin: float, factor: float) -> None:

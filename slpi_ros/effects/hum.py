@@ -1,26 +1,14 @@
 """Line interference or vibration: a signal that is periodic in time."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
 from math import pi
-from typing import ClassVar
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import (
-    Additive,
-    Candidate,
-    EffectContext,
-    FitContext,
-    ResidualContext,
-    Side,
-    Signal,
-    amplitude_and_phase,
-    rhythms,
-    wave,
-)
+from slpi_ros.effects.base import Additive, Candidate, EffectContext, FitContext, amplitude_and_phase, rhythms, wave
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, move, remaining
 from slpi_ros.effects.parameters import Fit, parameter
 
@@ -45,7 +33,7 @@ class Line:
     frequency: float = parameter(
         "Hz", "frequency", 0, 1e7, above=True, fit=Fit("relative", lambda _, of: 1e-3 / of.duration, 1e-3)
     )
-    amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0, size=True))
+    amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0))
     phase: float = parameter("rad", "phase at the record's start", -1e6, 1e6, fit=Fit("angle", 1e-4))
 
 
@@ -53,20 +41,17 @@ class Line:
 class Hum(Additive):
     """Sinusoids in time, ``y = x + sum_k amplitude_k sin(2 pi frequency_k t + phase_k)``, on the record's clock."""
 
-    name: ClassVar[str] = "hum"
-    acts_on: ClassVar[Signal] = "displacement"
-    side: ClassVar[Side] = "record"
-    what: ClassVar[str] = "disturbance that is periodic in time, one or several lines"
-    compensated: ClassVar[str] = "no"
-    needs_feedback: ClassVar[bool] = True
-    excitation: ClassVar[Excitation] = Excitation(
+    side = "record"
+    what = "disturbance that is periodic in time, one or several lines"
+    compensated = "no"
+    needs_feedback = True
+    excitation = Excitation(
         "Rest at three levels: nothing is commanded, so what oscillates there at one frequency comes from outside; "
         "an error of the sensor does not, at rest (sample at more than twice the mains frequency).",
         _draw,
     )
 
     lines: tuple[Line, ...] = parameter("", "spectral lines", count=(1, MOST_LINES))
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def joined(self, other: "Hum") -> "Hum | None":
         """Return the lines of both."""
@@ -89,7 +74,7 @@ class Hum(Additive):
         return sum(waves, np.zeros_like(around.t))
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield single lines at the strongest frequencies of the residual."""
         for frequency in rhythms(context, PEAKS, SLOWEST):
             yield Candidate(wave(2 * np.pi * frequency * context.t), partial(cls._at, frequency))

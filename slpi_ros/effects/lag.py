@@ -1,26 +1,14 @@
 """Lag of the amplifier: first-order response of the piezo voltage to the command."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import (
-    Candidate,
-    EffectBase,
-    EffectContext,
-    ResidualContext,
-    Side,
-    Signal,
-    StreamingBase,
-    TimeShift,
-    by_record,
-    usual_step,
-)
-from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, at_speeds
+from slpi_ros.effects.base import Candidate, Effect, EffectContext, FitContext, StreamingEffect, by_record, usual_step
+from slpi_ros.effects.excitation import Excitation, at_speeds
 from slpi_ros.effects.filters import DAMPING, Dynamics, Hold, filtered, first_order, hold
 from slpi_ros.effects.parameters import Fit, in_samples, parameter
 
@@ -28,32 +16,26 @@ from slpi_ros.effects.parameters import Fit, in_samples, parameter
 SETTLED = 5.0
 
 
-def _draw(path: DrivePath, limits: DriveLimits) -> None:
-    at_speeds(path, limits, 0.45, 0.55, straight=False)
-
-
 @dataclass(frozen=True)
-class Lag(EffectBase):
+class Lag(Effect):
     """First-order lag, ``tau du/dt = v - u``."""
 
-    name: ClassVar[str] = "lag"
-    acts_on: ClassVar[Signal] = "voltage"
-    side: ClassVar[Side] = "stage"
-    what: ClassVar[str] = "first-order lag of the voltage, as of an amplifier, before the hysteresis"
-    compensated: ClassVar[str] = "yes"
-    time_shift: ClassVar[TimeShift] = "only"
-    dynamic: ClassVar[bool] = True
-    excitation: ClassVar[Excitation] = Excitation(
+    acts_on = "voltage"
+    side = "stage"
+    what = "first-order lag of the voltage, as of an amplifier, before the hysteresis"
+    compensated = "yes"
+    time_shift = "only"
+    dynamic = True
+    excitation = Excitation(
         "The same small loop as a sine, slow to fast: hysteresis stays as it is, the phase of a delay grows with "
         "frequency at full amplitude, and a lag also loses amplitude.",
-        _draw,
+        partial(at_speeds, low=0.45, high=0.55, straight=False),
         separates=("delay",),
     )
 
     time_constant: float = parameter(
-        "s", "time constant tau", 0, 1e4, above=True, fit=Fit("relative", in_samples, 1e-6, size=True)
+        "s", "time constant tau", 0, 1e4, above=True, fit=Fit("relative", in_samples, 1e-6)
     )
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
@@ -66,12 +48,11 @@ class Lag(EffectBase):
         return lagged - around.step(signal) * np.exp(-around.since / self.time_constant)
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield lags from a fraction of a sampling interval to many intervals."""
         for samples in (0.5, 2.0, 8.0, 32.0):
             tau = samples * usual_step(context.t)
-            column = context.respond(cls(tau).apply(context.u, context.around)) - context.h
-            yield Candidate(column[:, None], partial(cls._times, tau))
+            yield Candidate(cls(tau).column(context)[:, None], partial(cls._times, tau))
 
     @classmethod
     def _times(cls, tau: float, gains: FloatArray) -> "Lag | None":
@@ -105,7 +86,7 @@ class Lag(EffectBase):
         return StreamingLag(self.time_constant)
 
 
-class StreamingLag(StreamingBase):
+class StreamingLag(StreamingEffect):
     """Streaming (sample by sample) first-order lag."""
 
     def __init__(self, time_constant: float) -> None:

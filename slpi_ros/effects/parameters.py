@@ -40,8 +40,6 @@ class Fit:
     within_record: bool = False
     # Whether it is a displacement that stays near those of the record.
     near_motion: bool = False
-    # Whether the effect is none where it is 0.
-    size: bool = False
     # Whether it is the state at the start of each record; an entry that is 0 stays 0.
     start: bool = False
     # Value that stays, as 0 of what is not there, or 1 of a mode that has all of the motion.

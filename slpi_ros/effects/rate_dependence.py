@@ -1,28 +1,16 @@
 """Rate dependence: loops widen with the logarithm of the rate, as thermally activated domain walls do."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
-from itertools import product
+from itertools import chain, product, repeat
 from math import copysign, exp, log, sqrt
-from typing import TYPE_CHECKING, Any, ClassVar
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import (
-    Candidate,
-    EffectBase,
-    EffectContext,
-    FitContext,
-    ResidualContext,
-    Side,
-    Signal,
-    StreamingBase,
-    TimeShift,
-    Unsure,
-    by_record,
-)
+from slpi_ros.effects.base import Candidate, Effect, EffectContext, FitContext, StreamingAround, Unsure, by_record
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter
 from slpi_ros.hysteresis.rate_law import followed, solved
@@ -57,7 +45,7 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 
 @dataclass(frozen=True)
-class RateDependence(EffectBase):
+class RateDependence(Effect):
     """Rate law of the hysteresis (Eyring), ``v = u + c asinh((du/dt) / s0)``, ``y = H[u] + g (v - u)``.
 
     The hysteresis ``H`` feels the voltage ``u``, which follows the applied voltage ``v``; the reversible part ``g`` of
@@ -68,17 +56,16 @@ class RateDependence(EffectBase):
     H. Eyring, Viscosity, plasticity, and diffusion as examples of absolute reaction rates, J. Chem. Phys. 4, 283, 1936.
     """
 
-    name: ClassVar[str] = "rate_dependence"
-    acts_on: ClassVar[Signal] = "hysteresis"
-    side: ClassVar[Side] = "stage"
-    what: ClassVar[str] = (
+    acts_on = "hysteresis"
+    side = "stage"
+    what = (
         "loops widen with the logarithm of the drive rate, and creep at rest, by one law (Eyring): "
         "`v = u + c asinh(u'/s0)`, with a reversible part that does not wait"
     )
-    compensated: ClassVar[str] = "exactly"
-    time_shift: ClassVar[TimeShift] = "partly"
-    dynamic: ClassVar[bool] = True
-    excitation: ClassVar[Excitation] = Excitation(
+    compensated = "exactly"
+    time_shift = "partly"
+    dynamic = True
+    excitation = Excitation(
         "Loops of three sizes at three speeds each, some of different size at the same volts per second: a linear "
         "filter treats these alike, loops that widen with the drive rate do not.",
         _draw,
@@ -87,7 +74,7 @@ class RateDependence(EffectBase):
 
     threshold: float = parameter(
         "V", "half-width c that loops gain for each factor of e in the rate", 0, 1e5,
-        fit=Fit("logarithmic", 1e-4, 1e-6, size=True),
+        fit=Fit("logarithmic", 1e-4, 1e-6),
     )  # fmt: skip
     onset_rate: float = parameter(
         "V/s", "rate s0 above which they widen", 1e-12, 1e12, fit=Fit("logarithmic", 1e-4, 1e-9)
@@ -102,7 +89,6 @@ class RateDependence(EffectBase):
         "V", "difference v - u at the start of each record", -1e5, 1e5, default=(), count=(0, 1000),
         fit=Fit("relative", start=True),
     )  # fmt: skip
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     @property
     def unsure(self) -> Unsure:
@@ -133,12 +119,8 @@ class RateDependence(EffectBase):
         """Return the voltage that the hysteresis feels, shape (N,), volts."""
         from slpi_ros.hysteresis.compiled import felt
 
-        times = around.split(around.t)
-        leads = (*self.initial, *(0.0,) * len(times))
-        law = self.threshold, self.onset_rate
-        parts = zip(times, around.split(signal), leads, strict=False)
-        whole = [felt(t, v, *law, lead) for t, v, lead in parts]
-        return whole[0] if len(whole) == 1 else np.concatenate(whole)
+        leads, law = chain(self.initial, repeat(0.0)), (self.threshold, self.onset_rate)
+        return around.each(lambda v, record: felt(record.t, v, *law, next(leads)), signal)
 
     def beside(self, v: FloatArray, u: FloatArray) -> FloatArray:
         """Return the reversible displacement, shape (N,), m, for applied voltages `v` and felt ones `u`, volts."""
@@ -157,7 +139,7 @@ class RateDependence(EffectBase):
         return v
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield laws over a grid of thresholds and onset rates, with a free reversible gain."""
         rate, span = float(np.sqrt(np.mean(np.gradient(context.u, context.t) ** 2))), float(np.ptp(context.u))
         records = zip(*(context.around.split(each) for each in (context.t, context.u, context.y)), strict=True)
@@ -201,7 +183,7 @@ class RateDependence(EffectBase):
         return StreamingRateDependence(self)
 
 
-class StreamingRateDependence(StreamingBase):
+class StreamingRateDependence(StreamingAround):
     """Streaming (sample by sample) rate law around the hysteresis."""
 
     def __init__(self, law: RateDependence) -> None:

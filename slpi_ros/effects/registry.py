@@ -35,6 +35,9 @@ EFFECTS: dict[str, type[Any]] = {
     name: getattr(import_module(f"slpi_ros.effects.{name}"), name.title().replace("_", "")) for name in MODULES
 }
 
+# What documents have for parameters, and for a parameter with one number for each name.
+NAMED = "names with numbers"
+
 
 def base_name(label: str) -> str:
     """Return the name of the effect of an alternative, such as ``surroundings /room/temperature``."""
@@ -67,7 +70,7 @@ def from_document(document: Any) -> Effect:
         found = name[:40] if isinstance(name, str) else type(name).__name__
         raise ModelError(f"no effect {found!r}; this version knows {', '.join(EFFECTS)}")
     read = _built(name, "parameters", EFFECTS[name], _member(document, "parameters"))
-    spread = _mapping(name, "uncertainty", document.get("uncertainty", {}))
+    spread = _of_type(name, "uncertainty", document.get("uncertainty", {}), Mapping, NAMED)
     read["uncertainty"] = {
         str(key): _number(name, f"uncertainty of {str(key)[:40]!r}", value) for key, value in spread.items()
     }
@@ -95,7 +98,7 @@ def _plain(value: Any) -> Any:
 
 def _built(effect: str, what: str, kind: Any, value: Any) -> dict[str, Any]:
     """Convert a mapping to the fields of a dataclass other than `uncertainty`, by name."""
-    given = _mapping(effect, what, value)
+    given = _of_type(effect, what, value, Mapping, NAMED)
     wanted = {item.name: item for item in fields(kind) if item.name != "uncertainty"}
     if not {key for key, item in wanted.items() if item.default is MISSING} <= given.keys() <= wanted.keys():
         raise ModelError(f"effect '{effect}': {what} are {', '.join(map(str, given))[:80]!r}; give {', '.join(wanted)}")
@@ -107,25 +110,22 @@ def _read(effect: str, what: str, kind: Any, value: Any, default: Any = MISSING)
     """Convert a value to the type `kind`: a number, a tuple or mapping of numbers, or a tuple of dataclasses."""
     holds: Any = get_origin(kind) or kind
     if holds is tuple:
-        if not isinstance(value, list | tuple):
-            raise ModelError(f"effect '{effect}': {what} is of type {type(value).__name__}; give a list")
-        return tuple(_read(effect, f"{what}.{k}", get_args(kind)[0], each) for k, each in enumerate(value))
+        each = enumerate(_of_type(effect, what, value, list | tuple, "a list"))
+        return tuple(_read(effect, f"{what}.{k}", get_args(kind)[0], one) for k, one in each)
     if holds is Mapping:
-        return {str(key): _number(effect, what, each) for key, each in _mapping(effect, what, value).items()}
+        return {
+            str(key): _number(effect, what, each) for key, each in _of_type(effect, what, value, Mapping, NAMED).items()
+        }
     if holds is str:
-        if not isinstance(value, str):
-            raise ModelError(f"effect '{effect}': {what} is of type {type(value).__name__}; give a text")
-        return value
+        return _of_type(effect, what, value, str, "a text")
     if is_dataclass(holds):
         return kind(**_built(effect, what, kind, value))
     return default if value is None and isinstance(default, float) else _number(effect, what, value)
 
 
 def _number(effect: str, what: str, value: Any) -> float:
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        raise ModelError(f"effect '{effect}': {what} is of type {type(value).__name__}; give a number")
     try:
-        return float(value)
+        return float(_of_type(effect, what, value, int | float, "a number"))
     except OverflowError:
         raise ModelError(f"effect '{effect}': {what} is too large; give a finite number") from None
 
@@ -136,7 +136,8 @@ def _member(document: Any, key: str) -> Any:
     return document[key]
 
 
-def _mapping(effect: str, what: str, value: Any) -> Mapping[Any, Any]:
-    if not isinstance(value, Mapping):
-        raise ModelError(f"effect '{effect}': {what} is of type {type(value).__name__}; give names with numbers")
+def _of_type(effect: str, what: str, value: Any, kind: Any, need: str) -> Any:
+    """Return a value that is of the type `kind`; a truth value is no number."""
+    if isinstance(value, bool) or not isinstance(value, kind):
+        raise ModelError(f"effect '{effect}': {what} is of type {type(value).__name__}; give {need}")
     return value

@@ -2,25 +2,21 @@
 
 from collections import deque
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise, zip_longest
 from math import inf, pi, sqrt
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import (
     Candidate,
-    EffectBase,
+    Effect,
     EffectContext,
     FitContext,
-    ResidualContext,
-    Side,
-    Signal,
-    StreamingBase,
-    TimeShift,
+    StreamingEffect,
     by_record,
     rhythms,
     usual_step,
@@ -148,7 +144,7 @@ class Unringing:
             desired.popleft()
 
 
-class StreamingResonance(StreamingBase):
+class StreamingResonance(StreamingEffect):
     """Streaming (sample by sample) resonance."""
 
     def __init__(self, resonance: "Resonance") -> None:
@@ -227,7 +223,7 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 
 @dataclass(frozen=True)
-class Resonance(EffectBase):
+class Resonance(Effect):
     """Superposition of second-order modes, ``y = h + sum_k gain_k (M_k[h] - h)``, ``M_k`` a `Mode`.
 
     With ``D_k`` the polynomial of mode k, ``y = N / (D_1 D_2 ..) h``. The inverse is the product of ``D_k / N_k``, with
@@ -237,18 +233,16 @@ class Resonance(EffectBase):
     is unstable runs backward in time, see `invert`.
     """
 
-    name: ClassVar[str] = "resonance"
-    acts_on: ClassVar[Signal] = "displacement"
-    side: ClassVar[Side] = "stage"
-    is_filter: ClassVar[bool] = True
-    what: ClassVar[str] = "modes of the mechanics, ringing or well damped, each with its share of the motion"
-    compensated: ClassVar[str] = (
+    side = "stage"
+    is_filter = True
+    what = "modes of the mechanics, ringing or well damped, each with its share of the motion"
+    compensated = (
         "on trajectories exactly; sample by sample if a part of the motion follows at once, else what would ring is "
         "taken out"
     )
-    time_shift: ClassVar[TimeShift] = "partly"
-    looks_ahead: ClassVar[bool] = True
-    excitation: ClassVar[Excitation] = Excitation(
+    time_shift = "partly"
+    looks_ahead = True
+    excitation = Excitation(
         "Small steps as fast as allowed with time to ring down, at three levels, then a sweep up to a sixth of the "
         "sampling rate: only a resonance rings on, at one frequency (sample at six times that or more).",
         _draw,
@@ -258,7 +252,6 @@ class Resonance(EffectBase):
     )
 
     modes: tuple[Mode, ...] = parameter("", "modes of the mechanics", count=(1, MOST_MODES))
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -361,24 +354,20 @@ class Resonance(EffectBase):
         return [factor.zero for factor in self.factors() if isinstance(factor, Exact)]
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield light modes at the strongest frequencies of the residual, and others on a logarithmic grid."""
-
-        def column(mode: Mode) -> FloatArray:
-            return cls((mode,)).apply(context.h, context.around) - context.h
-
         highest = HIGHEST / usual_step(context.t)
         found = [frequency for frequency in rhythms(context, LINES, LOWEST) if frequency < highest]
         others = np.geomspace(min(SLOWEST, highest), highest, OTHERS).tolist()
         for frequency in (*found, *others):
             for damping in DAMPINGS if frequency in found else WELL_DAMPED:
                 mode = Mode(frequency, damping)
-                columns = [column(mode)]
+                columns = [cls((mode,)).column(context)]
                 if frequency in found and damping == DAMPINGS[0]:
                     # A mode that rings for long explains nothing beside its frequency: both are free to first order.
                     tuned = replace(mode, frequency=frequency * (1.0 + STEP * damping))
                     damped = replace(mode, damping=damping * (1.0 + STEP))
-                    columns = [*(column(one) - columns[0] for one in (tuned, damped)), *columns]
+                    columns = [*(cls((one,)).column(context) - columns[0] for one in (tuned, damped)), *columns]
                 yield Candidate(np.column_stack(columns), partial(cls._if_seen, mode), positive=1)
                 if frequency not in found:
                     # All of the motion, as of a mirror on its bearing.

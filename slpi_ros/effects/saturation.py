@@ -1,14 +1,14 @@
 """Saturation: the amplifier output is limited to a voltage range."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from math import inf, isinf
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
-from slpi_ros.effects.base import EffectBase, EffectContext, FitContext, ResidualContext, Side, Signal
+from slpi_ros.effects.base import Effect, EffectContext, FitContext
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter, require
 
@@ -32,15 +32,14 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 
 @dataclass(frozen=True)
-class Saturation(EffectBase):
+class Saturation(Effect):
     """Limits of the voltage at the piezo, which the limits of the command keep, see `passes`."""
 
-    name: ClassVar[str] = "saturation"
-    acts_on: ClassVar[Signal] = "voltage"
-    side: ClassVar[Side] = "stage"
-    what: ClassVar[str] = "the amplifier clips"
-    compensated: ClassVar[str] = "no voltage undoes it: displacements beyond it are out of reach"
-    excitation: ClassVar[Excitation] = Excitation(
+    acts_on = "voltage"
+    side = "stage"
+    what = "the amplifier clips"
+    compensated = "no voltage undoes it: displacements beyond it are out of reach"
+    excitation = Excitation(
         "Peaks that come up to both limits in steps, slow and fast, with a hold at each: a clipped amplifier stops "
         "at one voltage at any speed, where hysteresis and lag go on to the peak.",
         _draw,
@@ -48,7 +47,6 @@ class Saturation(EffectBase):
 
     lower: float = _limit(-inf)
     upper: float = _limit(inf)
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -67,7 +65,7 @@ class Saturation(EffectBase):
         return np.clip(signal, self.lower, self.upper)
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator["Saturation"]:
+    def fit(cls, context: FitContext) -> Iterator["Saturation"]:
         """Yield limits beyond which the displacement remains constant while the voltage changes."""
         # At the piezo: what the hysteresis feels moves on while the voltage rests.
         v = context.u if context.around.voltage is None else context.around.voltage

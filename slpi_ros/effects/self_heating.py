@@ -1,26 +1,16 @@
 """Self-heating: the sensitivity of the stage follows the mean square rate of its voltage, as dissipated power."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
+from itertools import chain, repeat
 from math import expm1, inf
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import (
-    Candidate,
-    EffectBase,
-    EffectContext,
-    FitContext,
-    ResidualContext,
-    Side,
-    Signal,
-    StreamingBase,
-    decays,
-    longest,
-)
+from slpi_ros.effects.base import Candidate, Effect, EffectContext, FitContext, StreamingEffect, decays, longest
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, move, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter
 
@@ -56,7 +46,7 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 
 @dataclass(frozen=True)
-class SelfHeating(EffectBase):
+class SelfHeating(Effect):
     """A factor on the displacement, ``y = x0 + (1 + gain P) (x - x0)``, ``time_constant dP/dt = (dv/dt)^2 - P``.
 
     ``P`` is the mean square rate of the voltage ``v`` at the piezo, 0 at first: a stage at rest is cold.
@@ -64,14 +54,12 @@ class SelfHeating(EffectBase):
 
     # At each sample the rate up to the one before counts, so that the inverse needs no voltage that it is to return. A
     # change of the voltage in no time has no rate. The factor never changes by more than `MOST`.
-    name: ClassVar[str] = "self_heating"
-    acts_on: ClassVar[Signal] = "displacement"
-    side: ClassVar[Side] = "stage"
-    what: ClassVar[str] = "the sensitivity follows how fast the voltage moves, within seconds to minutes"
-    compensated: ClassVar[str] = "yes, from a cold start"
-    needs_voltage: ClassVar[bool] = True
-    changes_gain: ClassVar[bool] = True
-    excitation: ClassVar[Excitation] = Excitation(
+    side = "stage"
+    what = "the sensitivity follows how fast the voltage moves, within seconds to minutes"
+    compensated = "yes, from a cold start"
+    needs_voltage = True
+    changes_gain = True
+    excitation = Excitation(
         "Bursts of fast full loops, each followed by a hold at the top and slow loops: what warms the stage comes and "
         "goes with its own motion, where a drift of zero or sensitivity goes on by itself.",
         _draw,
@@ -81,7 +69,7 @@ class SelfHeating(EffectBase):
 
     gain: float = parameter(
         "s^2/V^2", "relative change of the sensitivity for each unit of the mean square rate of the voltage", -1e6, 1e6,
-        fit=Fit("linear", size=True),
+        fit=Fit("linear"),
     )  # fmt: skip
     time_constant: float = parameter(
         "s", "time constant with which the stage warms up and cools down", 1e-3, 1e7,
@@ -96,7 +84,6 @@ class SelfHeating(EffectBase):
         "V^2/s^2", "mean square rate of the voltage at the start of each record, 0: cold", 0, 1e18, default=(),
         count=(0, 1000), fit=Fit("relative", least=0.0, start=True),
     )  # fmt: skip
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     @classmethod
     def limited(cls, changed: dict[str, Any]) -> dict[str, Any]:
@@ -122,7 +109,7 @@ class SelfHeating(EffectBase):
         """Return whether the change is small, comes and goes, and has an origin near the measured displacements."""
         near = context.near_motion(self.origin)
         # The voltage that the hysteresis feels is at most as fast as that at the piezo.
-        around = EffectContext(context.t, records=context.records, voltage=context.u)
+        around = context.around.driven(context.u)
         rates = _mean_square_rates(self.time_constant, around)
         largest = float(rates.max())
         fall = max(float(np.max(np.maximum.accumulate(own) - own)) for own in around.split(rates))
@@ -142,7 +129,7 @@ class SelfHeating(EffectBase):
         return self.origin + (signal - self.origin) / self.factor(around)
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield time constants up to a multiple of the longest record, for cold stages and for warm ones."""
         # A shift in proportion to each change of the sensitivity is fitted with it; their ratio gives the origin.
         slowest, (low, high) = LONGEST * longest(context.around), (float(context.h.min()), float(context.h.max()))
@@ -156,7 +143,7 @@ class SelfHeating(EffectBase):
                 yield Candidate(own, partial(cls._through, tau, most, low, high))
                 warm = [cooling[:, [k]] * moved for k in range(cooling.shape[1])]
                 columns = np.column_stack([*warm, own])
-                yield Candidate(columns, partial(cls._through, tau, most, low, high), starting=2 * len(warm))
+                yield Candidate(columns, partial(cls._through, tau, most, low, high))
 
     @classmethod
     def _through(cls, tau: float, most: float, low: float, high: float, found: FloatArray) -> "SelfHeating | None":
@@ -188,7 +175,7 @@ class SelfHeating(EffectBase):
         return StreamingSelfHeating(self)
 
 
-class StreamingSelfHeating(StreamingBase):
+class StreamingSelfHeating(StreamingEffect):
     """Streaming (sample by sample) self-heating; its state is the mean square rate and the last voltage (V)."""
 
     def __init__(self, effect: SelfHeating) -> None:
@@ -245,6 +232,9 @@ def _mean_square_rates(
         return np.zeros_like(around.t)
     from slpi_ros.effects.paths import heated
 
-    times = around.split(around.t)
-    parts = zip(times, around.split(around.voltage), (*initial, *(0.0,) * len(times)), strict=False)
-    return np.concatenate([heated(np.diff(t, prepend=t[:1]), v, time_constant, first, most) for t, v, first in parts])
+    first = chain(initial, repeat(0.0))
+
+    def rates(t: FloatArray, v: FloatArray, _: EffectContext) -> FloatArray:
+        return heated(np.diff(t, prepend=t[:1]), v, time_constant, next(first), most)
+
+    return around.each(rates, around.t, around.voltage)

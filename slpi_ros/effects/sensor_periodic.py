@@ -1,24 +1,20 @@
 """Periodic error of the sensor, such as the nonlinearity of an interferometer."""
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from dataclasses import dataclass
 from functools import partial
 from math import cos, pi, sin
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.effects.base import (
     Candidate,
-    EffectBase,
+    Effect,
     EffectContext,
     FitContext,
-    ResidualContext,
-    Sharing,
-    Side,
-    Signal,
-    StreamingBase,
+    StreamingEffect,
     amplitude_and_phase,
     strongest_lines,
     wave,
@@ -47,19 +43,15 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 
 @dataclass(frozen=True)
-class SensorPeriodic(EffectBase):
+class SensorPeriodic(Effect):
     """Periodic sensor error, ``y = x + amplitude sin(2 pi x / period + phase)``."""
 
-    name: ClassVar[str] = "sensor_periodic"
-    acts_on: ClassVar[Signal] = "displacement"
-    side: ClassVar[Side] = "sensor"
-    what: ClassVar[str] = "interferometer error, periodic in the displacement"
-    compensated: ClassVar[str] = (
-        "not the stage: the readings are corrected, as long as the zero of the sensor does not move"
-    )
+    side = "sensor"
+    what = "interferometer error, periodic in the displacement"
+    compensated = "not the stage: the readings are corrected, as long as the zero of the sensor does not move"
     # A sensor may start each record with another phase.
-    sharing: ClassVar[Sharing] = "either"
-    excitation: ClassVar[Excitation] = Excitation(
+    sharing = "either"
+    excitation = Excitation(
         "Slow ramps of constant speed over the whole range, at two speeds: an error of the sensor has the same "
         "period in displacement at both speeds, line interference the same in time, and hysteresis is smooth.",
         _draw,
@@ -69,9 +61,8 @@ class SensorPeriodic(EffectBase):
         "m", "period in displacement, such as half a wavelength", 1e-12, 1e3,
         fit=Fit("relative", lambda value, _: 1e-5 * abs(value), SHORTEST, LONGEST),
     )  # fmt: skip
-    amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0, most=LONGEST, size=True))
+    amplitude: float = parameter("m", "amplitude", 0, 1e3, fit=Fit("relative", least=0.0, most=LONGEST))
     phase: float = parameter("rad", "phase at displacement 0", -1e3, 1e3, fit=Fit("angle", 1e-4))
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -109,7 +100,7 @@ class SensorPeriodic(EffectBase):
         return x
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield the strongest spectral lines of the residual as a function of the displacement."""
         # Displacement seen by the sensor, which includes the other effects.
         seen = context.y - context.residual
@@ -143,7 +134,7 @@ class SensorPeriodic(EffectBase):
         return StreamingSensorError(self)
 
 
-class StreamingSensorError(StreamingBase):
+class StreamingSensorError(StreamingEffect):
     """Streaming (sample by sample) sensor error, without state."""
 
     def __init__(self, sensor: SensorPeriodic) -> None:

@@ -1,25 +1,13 @@
 """Slew limit of the amplifier: its current bounds how fast the voltage at the piezo changes."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import (
-    Candidate,
-    EffectBase,
-    EffectContext,
-    FitContext,
-    ResidualContext,
-    Side,
-    Signal,
-    StreamingBase,
-    TimeShift,
-    by_record,
-)
+from slpi_ros.effects.base import Candidate, Effect, EffectContext, FitContext, StreamingEffect, by_record
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, move, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, parameter
 
@@ -42,17 +30,16 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 
 @dataclass(frozen=True)
-class Slew(EffectBase):
+class Slew(Effect):
     """Limit of the rate of the voltage at the piezo, ``|du/dt| <= rate``, which else is the command."""
 
-    name: ClassVar[str] = "slew"
-    acts_on: ClassVar[Signal] = "voltage"
-    side: ClassVar[Side] = "stage"
-    what: ClassVar[str] = "the amplifier's current limits how fast its voltage changes"
-    compensated: ClassVar[str] = "no voltage undoes it: faster motion is out of reach, and what is late is known"
-    time_shift: ClassVar[TimeShift] = "partly"
-    dynamic: ClassVar[bool] = True
-    excitation: ClassVar[Excitation] = Excitation(
+    acts_on = "voltage"
+    side = "stage"
+    what = "the amplifier's current limits how fast its voltage changes"
+    compensated = "no voltage undoes it: faster motion is out of reach, and what is late is known"
+    time_shift = "partly"
+    dynamic = True
+    excitation = Excitation(
         "Straight ramps over the whole range, ever faster up to the slew limit, a hold after each: an amplifier at "
         "its own limit arrives later and later from one speed on and is exact below, where a lag is late at any speed.",
         _draw,
@@ -64,12 +51,11 @@ class Slew(EffectBase):
         "V/s", "largest rate of the voltage, up and down", 1e-6, 1e12,
         fit=Fit("relative", lambda value, _: 1e-3 * value, 1e-6),
     )  # fmt: skip
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def plausible(self, context: FitContext) -> bool:
         """Return whether a noticeable part of the drive is faster, and the voltage is late there only."""
-        rates, around = _rates(context.t, context.v), EffectContext(context.t, records=context.records)
-        late = np.abs(self.apply(context.v, around) - context.v) > LATE * float(np.ptp(context.v))
+        rates = _rates(context.t, context.v)
+        late = np.abs(self.apply(context.v, context.around) - context.v) > LATE * float(np.ptp(context.v))
         moving = rates > 0.01 * np.quantile(rates, FASTEST)
         return float(np.mean(rates[moving] > self.rate)) >= LEAST_FASTER and float(np.mean(late)) <= MOST_LATE
 
@@ -99,12 +85,11 @@ class Slew(EffectBase):
         return signal.copy()
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield rates below the fastest of the drive."""
         fastest = float(np.quantile(_rates(context.t, context.u), FASTEST))
         for rate in [share * fastest for share in SHARES if fastest > 0.0]:
-            column = context.respond(cls(rate).apply(context.u, context.around)) - context.h
-            yield Candidate(column[:, None], partial(cls._near, rate))
+            yield Candidate(cls(rate).column(context)[:, None], partial(cls._near, rate))
 
     @classmethod
     def _near(cls, rate: float, gains: FloatArray) -> "Slew | None":
@@ -123,7 +108,7 @@ class Slew(EffectBase):
         return StreamingSlew(self.rate)
 
 
-class StreamingSlew(StreamingBase):
+class StreamingSlew(StreamingEffect):
     """Streaming (sample by sample) limit of the rate."""
 
     def __init__(self, rate: float) -> None:

@@ -1,15 +1,14 @@
 """Steps: sudden jumps of the zero that stay."""
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from itertools import groupby
-from typing import ClassVar
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import Additive, Candidate, EffectContext, FitContext, ResidualContext, Side, Signal
+from slpi_ros.effects.base import Additive, Candidate, EffectContext, FitContext
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, move, remaining
 from slpi_ros.effects.jumps import follows_drive, jumps, sudden
 from slpi_ros.effects.parameters import Fit, parameter, require
@@ -29,13 +28,11 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 class Steps(Additive):
     """Jumps of the zero, ``y = x + sum of the sizes at times up to t``, on the record's clock."""
 
-    name: ClassVar[str] = "steps"
-    acts_on: ClassVar[Signal] = "displacement"
-    side: ClassVar[Side] = "record"
-    what: ClassVar[str] = "sudden jumps of the zero that stay: slips of the mount or the sensor, fringe jumps"
-    compensated: ClassVar[str] = "no"
-    needs_feedback: ClassVar[bool] = True
-    excitation: ClassVar[Excitation] = Excitation(
+    side = "record"
+    what = "sudden jumps of the zero that stay: slips of the mount or the sensor, fringe jumps"
+    compensated = "no"
+    needs_feedback = True
+    excitation = Excitation(
         "Rest at seven levels: nothing is commanded, so what jumps there within one sample and stays is the zero, "
         "where creep and drift are gradual and line interference comes back.",
         _draw,
@@ -45,7 +42,6 @@ class Steps(Additive):
     sizes: tuple[float, ...] = parameter(
         "m", "sizes of the jumps", -1e3, 1e3, count=(0, 10000), fit=Fit("linear", 1e-9)
     )
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -82,7 +78,7 @@ class Steps(Additive):
         return np.append(0.0, np.cumsum(self.sizes))[np.searchsorted(self.times, around.t, side="right")]
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield the clearest jumps of the residual, in increasing number."""
         left = np.interp(context.t, context.t[context.used], context.residual[context.used])
         found = [k for k, _ in jumps(left, COUNTS[-1])]

@@ -1,32 +1,30 @@
 """Surroundings: the stage follows quantities that were recorded beside it, such as temperature, load or humidity."""
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from math import exp, isfinite
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.effects.base import (
     Candidate,
-    EffectBase,
+    Effect,
     EffectContext,
     FitContext,
     Followed,
     FollowedGain,
-    ResidualContext,
-    Side,
-    Signal,
-    StreamingBase,
+    StreamingEffect,
     Unsure,
+    by_record,
     decays,
     longest,
 )
 from slpi_ros.effects.excitation import Excitation, full_loops
 from slpi_ros.effects.filters import filtered, hold
-from slpi_ros.effects.parameters import Fit, Leaf, parameter, require, text
+from slpi_ros.effects.parameters import Fit, parameter, require, text
 from slpi_ros.effects.readings import ReadingsFilter, best_filter, line_after
 from slpi_ros.errors import length
 from slpi_ros.io.record import Course
@@ -88,25 +86,34 @@ class Quantity:
         value = around.surroundings.get(self.key)
         if value is None:
             return np.zeros_like(around.t)
-        return _lagged(_advanced(value - self.reference, self.lead, around), self.time_constant, around)
+        return self._felt(value - self.reference, around)
+
+    @by_record
+    def _felt(self, moved: FloatArray, around: EffectContext) -> FloatArray:
+        """Return what the stage feels of a deviation, shape (N,): at the end it stays, at the start it is at rest."""
+        if self.lead:
+            moved = np.interp(around.t + self.lead, around.t, moved)
+        grid = around.uniform
+        if not (self.time_constant and grid.dt > 0.0):
+            return moved
+        now, before, kept = hold(grid.dt, self.time_constant)
+        return np.asarray(moved[0] + grid.off(filtered([now, before], [1.0, -kept], grid.on(moved - moved[0]))))
 
 
 @dataclass(frozen=True)
-class Surroundings(EffectBase):
+class Surroundings(Effect):
     """Zero and sensitivity that follow quantities, ``y = x0 + (1 + sum_k s_k w_k) (x - x0) + sum_k o_k w_k``.
 
     ``w_k`` is the deviation of a quantity from its reference, or that after a first-order lag; ``o_k`` and ``s_k`` are
     `offset_gain` and `sensitivity_gain`, and ``x0`` is `origin`.
     """
 
-    name: ClassVar[str] = "surroundings"
-    acts_on: ClassVar[Signal] = "displacement"
-    side: ClassVar[Side] = "stage"
-    what: ClassVar[str] = "zero or sensitivity follow a recorded quantity (temperature, load, humidity, pressure)"
-    compensated: ClassVar[str] = "yes, if the quantity is measured in use"
-    changes_gain: ClassVar[bool] = True
-    follows_quantities: ClassVar[bool] = True
-    excitation: ClassVar[Excitation] = Excitation(
+    side = "stage"
+    what = "zero or sensitivity follow a recorded quantity (temperature, load, humidity, pressure)"
+    compensated = "yes, if the quantity is measured in use"
+    changes_gain = True
+    follows_quantities = True
+    excitation = Excitation(
         "Full loops one after the other while one quantity alone is changed on purpose, up and down several times and "
         "each time for another while (heat on and off, load on and off): what comes and goes with it is its doing, "
         "and no drift does that.",
@@ -122,7 +129,6 @@ class Surroundings(EffectBase):
         "m", "what is left of before the start of each record, quantity by quantity with a time constant", -1e3, 1e3,
         default=(), count=(0, 4000),
     )  # fmt: skip
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -169,10 +175,6 @@ class Surroundings(EffectBase):
         """Return whether the sensitivity changes by little."""
         changes = sum(abs(one.sensitivity_gain) * (one.highest - one.lowest) for one in self.quantities)
         return bool(changes <= LARGEST)
-
-    def free_leaves(self) -> list[Leaf]:
-        """Return the fitted numbers; what is 0 is not there."""
-        return [leaf for leaf in super().free_leaves() if not leaf.place.startswith("initial")]
 
     def parts(self, around: EffectContext) -> tuple[FloatArray, FloatArray]:
         """Return the factor of the sensitivity, and the displacement (m), shape (N,) each."""
@@ -231,7 +233,7 @@ class Surroundings(EffectBase):
         return sum((amplitude * column for amplitude, column in pairs), np.zeros_like(around.t))
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield for each quantity offset, sensitivity and both, at once and with time constants."""
         around, low = context.around, float(context.h.min())
         slowest = LONGEST * longest(around)
@@ -256,7 +258,6 @@ class Surroundings(EffectBase):
                     yield Candidate(
                         np.column_stack([starting, *own_columns]),
                         partial(cls._through, one, size, low, with_offset, len(own_columns)),
-                        starting=starting.shape[1],
                         group=group,
                     )
 
@@ -284,7 +285,7 @@ class Surroundings(EffectBase):
         return StreamingSurroundings(self)
 
 
-class StreamingSurroundings(StreamingBase):
+class StreamingSurroundings(StreamingEffect):
     """Streaming (sample by sample) surroundings: each quantity holds its last value, at first the reference.
 
     Of noisy or late readings it is what their filter gives.
@@ -367,30 +368,6 @@ def _with_filter(one: Quantity, courses: Sequence[Course]) -> Quantity:
     """Return a quantity with the filter of its readings that takes the least time, of those that suit the records."""
     found = min((best_filter(course, one.lead) for course in courses), default=ReadingsFilter())
     return replace(one, averaging=found.time_constant, ahead=found.ahead, reading_error=found.error)
-
-
-def _advanced(value: FloatArray, lead: float, around: EffectContext) -> FloatArray:
-    """Return a quantity a time (s) later, shape (N,); at the end of each record it stays."""
-    if not lead:
-        return value
-    pairs = zip(around.split(value), around.split(around.t), strict=True)
-    return np.concatenate([np.interp(t + lead, t, own) for own, t in pairs])
-
-
-def _lagged(value: FloatArray, time_constant: float, around: EffectContext) -> FloatArray:
-    """Return a quantity after a first-order lag, shape (N,), from equilibrium at the start of each record."""
-    if not time_constant:
-        return value
-    parts = []
-    for own, record in zip(around.split(value), around.records or (around,), strict=True):
-        grid = record.uniform
-        if not (own.size and grid.dt > 0.0):
-            parts.append(own)
-            continue
-        now, before, kept = hold(grid.dt, time_constant)
-        moved = grid.on(own - own[0])
-        parts.append(own[0] + grid.off(filtered([now, before], [1.0, -kept], moved)))
-    return np.concatenate(parts)
 
 
 def _described(one: Quantity) -> str:

@@ -1,14 +1,13 @@
 """Thermal drift: slow change of the displacement, independent of the voltage."""
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, replace
 from functools import partial
-from typing import ClassVar
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
-from slpi_ros.effects.base import Additive, Candidate, EffectContext, FitContext, ResidualContext, Side, Signal
+from slpi_ros.effects.base import Additive, Candidate, EffectContext, FitContext
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
 from slpi_ros.effects.parameters import Fit, Leaf, parameter, require
 
@@ -34,13 +33,11 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 class ThermalDrift(Additive):
     """A displacement that depends on time only, linear between knots and constant outside."""
 
-    name: ClassVar[str] = "thermal_drift"
-    acts_on: ClassVar[Signal] = "displacement"
-    side: ClassVar[Side] = "record"
-    what: ClassVar[str] = "slow change that does not follow the voltage"
-    compensated: ClassVar[str] = "no"
-    needs_feedback: ClassVar[bool] = True
-    excitation: ClassVar[Excitation] = Excitation(
+    side = "record"
+    what = "slow change that does not follow the voltage"
+    compensated = "no"
+    needs_feedback = True
+    excitation = Excitation(
         "The same full loop over and over, with the same holds: voltage, memory and creep repeat, so what differs "
         "from one repeat to the next follows time alone.",
         _draw,
@@ -50,7 +47,6 @@ class ThermalDrift(Additive):
 
     times: tuple[float, ...] = parameter("s", "times of the knots from the record's start", -1e9, 1e9)
     values: tuple[float, ...] = parameter("m", "displacements at the knots", -1e3, 1e3, fit=Fit("linear", 1e-9))
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -89,7 +85,7 @@ class ThermalDrift(Additive):
         return replace(self, values=tuple(value - end for value in self.values)), end
 
     @classmethod
-    def fit(cls, context: ResidualContext) -> Iterator[Candidate]:
+    def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield piecewise linear curves with an increasing number of knots."""
         for knots in KNOTS if float(np.ptp(context.t)) >= TAKES else ():
             times = np.linspace(context.t[0], context.t[-1], knots)

@@ -33,7 +33,8 @@ def test_a_sine_excites_its_own_frequency(frequency):
 def test_only_low_multiples_of_the_drive_may_be_hysteresis(frequency, expected):
     triangle = np.abs((1.25 * T) % 1.0 - 0.5) * 100
     whole = SimpleNamespace(records=())
-    view = seen(SimpleNamespace(evidence=evidence(triangle), t=T, u=0, h=0, y=0, used=0, effects=(), around=whole))
+    signals = dict.fromkeys(("u", "h", "y", "used", "residual", "respond"), 0)
+    view = seen(SimpleNamespace(evidence=evidence(triangle), t=T, effects=(), around=whole, **signals))
     assert Hum((Line(frequency, 1e-9, 0.0),)).plausible(view) is not expected
 
 

@@ -12,7 +12,7 @@ FloatArray = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Residual:
-    """A `ResidualContext` of N samples whose hysteresis is known: t (s), u (V), h and y (m)."""
+    """A `FitContext` of N samples whose hysteresis is known: t (s), u (V), h and y (m)."""
 
     t: FloatArray
     u: FloatArray

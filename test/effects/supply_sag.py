@@ -3,24 +3,12 @@
 The worked example of CONTRIBUTING.md: an effect that is none of the registry.
 """
 
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
-from typing import ClassVar
+from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
-from slpi_ros.effects.base import (
-    Candidate,
-    EffectBase,
-    EffectContext,
-    FitContext,
-    FloatArray,
-    ResidualContext,
-    Side,
-    Signal,
-    StreamingBase,
-    by_record,
-)
+from slpi_ros.effects.base import Candidate, Effect, EffectContext, FitContext, FloatArray, StreamingEffect, by_record
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, loops, remaining
 from slpi_ros.effects.parameters import Fit, parameter
 
@@ -34,15 +22,13 @@ def _draw(path: DrivePath, limits: DriveLimits) -> None:
 
 
 @dataclass(frozen=True)
-class SupplySag(EffectBase):
+class SupplySag(Effect):
     """An error of the sensor in proportion to the speed, in either direction: ``y = x + gain |dx/dt|``."""
 
-    name: ClassVar[str] = "supply_sag"
-    acts_on: ClassVar[Signal] = "displacement"
-    side: ClassVar[Side] = "sensor"
-    what: ClassVar[str] = "the reading changes with the speed, in either direction alike"
-    compensated: ClassVar[str] = "not the stage: the readings are corrected"
-    excitation: ClassVar[Excitation] = Excitation(
+    side = "sensor"
+    what = "the reading changes with the speed, in either direction alike"
+    compensated = "not the stage: the readings are corrected"
+    excitation = Excitation(
         "Straight ramps over the whole range at two speeds: the reading is off by the same on the way up and on the "
         "way down, where a lag is off by the opposite.",
         _draw,
@@ -50,7 +36,6 @@ class SupplySag(EffectBase):
     )
 
     gain: float = parameter("s", "displacement for each unit of speed", -1, 1, fit=Fit("linear", 1e-8))
-    uncertainty: Mapping[str, float] = field(default_factory=dict)
 
     @by_record
     def apply(self, signal: FloatArray, around: EffectContext) -> FloatArray:
@@ -61,9 +46,8 @@ class SupplySag(EffectBase):
         return signal - self.gain * np.abs(_speed(signal, around.t))
 
     @classmethod
-    def fit(cls, left: ResidualContext) -> Iterator[Candidate]:
-        column = cls(1.0).apply(left.h, left.around) - left.h
-        yield Candidate(column[:, None], lambda gains: cls(float(gains[0])))
+    def fit(cls, left: FitContext) -> Iterator[Candidate]:
+        yield Candidate(cls(1.0).column(left)[:, None], lambda gains: cls(float(gains[0])))
 
     def plausible(self, view: FitContext) -> bool:
         fastest = float(np.percentile(np.abs(_speed(view.h, view.t)), 99))
@@ -76,7 +60,7 @@ class SupplySag(EffectBase):
         return StreamingSupplySag(self.gain)
 
 
-class StreamingSupplySag(StreamingBase):
+class StreamingSupplySag(StreamingEffect):
     """The error sample by sample; its state is the last displacement (m)."""
 
     def __init__(self, gain: float) -> None:

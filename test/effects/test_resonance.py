@@ -10,7 +10,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
-from slpi_ros.effects.base import EffectBase, EffectContext
+from slpi_ros.effects.base import Effect, EffectContext
 from slpi_ros.effects.filters import Mode
 from slpi_ros.effects.resonance import Resonance
 
@@ -90,5 +90,5 @@ def test_a_path_that_begins_elsewhere_is_reached(damping, start, part):
     path = 1e-6 * np.sin(np.pi * t) ** 4
     around, rest = EffectContext.since_start(t, start=start), np.full_like(path, path[0])
     error = resonance.apply(resonance.invert(path, around), around) - path
-    way = resonance.apply(EffectBase.invert(resonance, rest, around), around) - rest
+    way = resonance.apply(Effect.invert(resonance, rest, around), around) - rest
     np.testing.assert_allclose(error, way, rtol=0, atol=1e-11)

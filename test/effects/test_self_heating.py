@@ -127,7 +127,7 @@ def test_fit_finds_a_warm_start():
     fits = []
     for candidate in SelfHeating.fit(record):
         gains, left, *_ = np.linalg.lstsq(candidate.columns, record.residual, rcond=None)
-        fits.append((float(left[0]), candidate.starting, candidate.effect(gains)))
+        fits.append((float(left[0]), candidate.columns.shape[1] - 2, candidate.effect(gains)))
     _, starting, best = min(fits, key=lambda one: one[0])
     assert starting == 2 and best.initial == pytest.approx((0.5 * POWER,), rel=0.5)
     assert all(not effect.initial for _, starting, effect in fits if effect and not starting)

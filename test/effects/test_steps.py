@@ -29,9 +29,9 @@ def view(y, more=0.0):
     """A fit that leaves `y` without jumps, where other effects have `more` than the hysteresis."""
     h, used = 2e-7 * V, np.ones(T.size, dtype=bool)
     zeros, left = (lambda: np.zeros(1)), (lambda name: y)
-    return FitContext(
-        *(T, V, V, h, h + y + more, used, 1e-10, ()), lambda: 0.7, lambda: [(0.7, 20.0)], zeros, lambda: ~used, left
-    )
+    signals = T, V, V, h, h + y + more, used, y
+    others = AROUND, 1e-10, (), lambda u: 2e-7 * u, lambda: 0.7, lambda: [(0.7, 20.0)], zeros, lambda: ~used, left
+    return FitContext(*signals, *others)
 
 
 @pytest.mark.parametrize("seed", range(4))

@@ -5,13 +5,17 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import MOST_LINES, Command, Result, finding_lines
+from slpi_ros.cli.command import MOST_LINES, Result, finding_lines
+
+HELP = "find the causes of a model's errors on bags and extend the model"
+EXAMPLE = "slpi diagnose calibration check --model model.json -o diagnosis"
 
 # Largest number of warnings on the records without -v.
 MOST_WARNINGS = 3
 
 
-def _add_options(command: ArgumentParser) -> None:
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     common.add_bags(command, "; several records allow cross-validation of each cause")
     command.add_argument("--model", metavar="MODEL.json", required=True, help="of the same stage")
     common.add_output(command, "DIR", "folder of diagnosis.json, extended_model.json and report.html")
@@ -25,7 +29,8 @@ def _add_options(command: ArgumentParser) -> None:
     common.add_sensor(command)
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.io.bag_reader import require_different
     from slpi_ros.io.schemas import format_document
@@ -70,11 +75,3 @@ def _run(options: Namespace) -> Result:
         verdict(limits, diagnosis_good(diagnosis)),
         [*warned, *described, page],
     )
-
-
-COMMAND = Command(
-    "find the causes of a model's errors on bags and extend the model",
-    "slpi diagnose calibration check --model model.json -o diagnosis",
-    _add_options,
-    _run,
-)

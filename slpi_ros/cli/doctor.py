@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result, command_line
+from slpi_ros.cli.command import Result, command_line
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.progress import report_progress
 
@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from slpi_ros.drivers.base import Device
     from slpi_ros.reports.doctor import Check
 
+HELP = "check bags, a model, a device and a running ROS graph, and say what to do"
+EXAMPLE = "slpi doctor calibration --model model.json"
+
 COMMANDS_TOPIC = "voltage_command"
 # Longest time to watch a running graph, seconds.
 LONGEST_WATCH = 3600.0
@@ -25,7 +28,8 @@ LONGEST_WATCH = 3600.0
 TIMED = 21
 
 
-def _add_options(command: ArgumentParser) -> None:
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     command.add_argument("bags", metavar="BAG", nargs="*", help="records to be checked; default: none")
     command.add_argument("--model", metavar="MODEL.json", help="model to be checked; default: that on stage_model")
     command.add_argument("--voltage-min", metavar="V", type=float, help="lowest voltage allowed; default: not checked")
@@ -52,7 +56,8 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument("--no-ros", action="store_true", help="check the files only; default: also a running graph")
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from importlib.util import find_spec
 
     from slpi_ros.io.bag_reader import read_bag
@@ -165,11 +170,3 @@ def _cycle_of(device: "Device") -> "tuple[float, FloatArray]":
         positions.append(device.read().positions)
         times.append(time.perf_counter() - begun)
     return statistics.median(times), np.array(positions)
-
-
-COMMAND = Command(
-    "check bags, a model, a device and a running ROS graph, and say what to do",
-    "slpi doctor calibration --model model.json",
-    _add_options,
-    _run,
-)

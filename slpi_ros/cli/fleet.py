@@ -5,11 +5,15 @@ import sys
 from argparse import ArgumentParser, Namespace
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result
+from slpi_ros.cli.command import Result
 from slpi_ros.errors import UsageError
 
+HELP = "identify, verify and follow many stages from many bags, on Dask"
+EXAMPLE = "slpi fleet bags -o fleet --workers 4"
 
-def _add_options(command: ArgumentParser) -> None:
+
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     command.add_argument(
         "sources", metavar="SOURCE", nargs="+", help="bag, folder of bags (recursively), or CSV list of bag and stage"
     )
@@ -32,7 +36,8 @@ def _add_options(command: ArgumentParser) -> None:
     common.add_with(command, "none; for a diagnosis every one that the bags hold")
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.fleet.pages import DOCUMENT, PAGE, report_fleet
     from slpi_ros.fleet.results import JOURNAL, TABLE
     from slpi_ros.io.outputs import allow_folder
@@ -57,11 +62,3 @@ def _run(options: Namespace) -> Result:
     )
     text = "\n".join(lines)
     return Result(text.splitlines(), text, "slpi refit MODEL.json BAG... of a stage that has changed", passed=usable)
-
-
-COMMAND = Command(
-    "identify, verify and follow many stages from many bags, on Dask",
-    "slpi fleet bags -o fleet --workers 4",
-    _add_options,
-    _run,
-)

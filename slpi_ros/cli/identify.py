@@ -5,10 +5,14 @@ from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result, command_line, finding_lines, say
+from slpi_ros.cli.command import Result, command_line, finding_lines, say
+
+HELP = "identify the model of a stage from a bag"
+EXAMPLE = "slpi identify calibration -o model.json --report report"
 
 
-def _add_options(command: ArgumentParser) -> None:
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     from slpi_ros.identification.fit import KINDS
 
     common.add_bags(command)
@@ -33,7 +37,8 @@ def _add_options(command: ArgumentParser) -> None:
     )
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.model.document import format_model, save_model
     from slpi_ros.model.sensor import Sensor
@@ -90,11 +95,3 @@ def _run(options: Namespace) -> Result:
         verdict(limits, model_good(model)),
         [*told, *lines, *describe_model(model)],
     )
-
-
-COMMAND = Command(
-    "identify the model of a stage from a bag",
-    "slpi identify calibration -o model.json --report report",
-    _add_options,
-    _run,
-)

@@ -6,11 +6,15 @@ from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result, command_line
+from slpi_ros.cli.command import Result, command_line
 from slpi_ros.errors import UsageError
 
+HELP = "test a model on bags not used to identify it: passed, failed or unproved"
+EXAMPLE = "slpi verify check --model model.json --tolerance 0.05"
 
-def _add_options(command: ArgumentParser) -> None:
+
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     from slpi_ros.io.desired import DESIRED, TRAJECTORY
     from slpi_ros.model.axis_model import START_MEMORIES
 
@@ -49,7 +53,8 @@ def _add_options(command: ArgumentParser) -> None:
     common.add_sensor(command)
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.io.schemas import format_document
     from slpi_ros.model.document import load_model
@@ -104,11 +109,3 @@ def _run(options: Namespace) -> Result:
         describe_verification(found),
         found.passed,
     )
-
-
-COMMAND = Command(
-    "test a model on bags not used to identify it: passed, failed or unproved",
-    "slpi verify check --model model.json --tolerance 0.05",
-    _add_options,
-    _run,
-)

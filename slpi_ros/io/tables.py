@@ -52,7 +52,7 @@ def import_table(
     # without, units are seconds, volts and `displacement_unit`, by default micrometres. Columns named by a topic, such
     # as ``/room/temperature``, are recorded quantities; other ones are left out. Empty cells and ``nan`` become NaN. If
     # the first time is negative or no stamp of a message, all times are shifted such that the record begins at 0.
-    options = ColumnOptions(time, tuple(voltage), tuple(displacement), displacement_unit, tuple(axes))
+    options = ColumnOptions(time, voltage, displacement, displacement_unit, axes)
     return import_with_summary(path, options).record
 
 

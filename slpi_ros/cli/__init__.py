@@ -22,8 +22,8 @@ from slpi_ros.identification.progress import report_progress, shown_on
 
 __all__ = ["COMMANDS", "MOST_LINES", "main", "parser"]
 
-# In the order of ``slpi --help``: each is a module with `HELP`, `EXAMPLE`, `add_options` and `run`. What loads slowly, the
-# numerical and plotting modules, is imported when it runs.
+# In the order of ``slpi --help``: each is a module with `HELP`, `EXAMPLE`, `add_options` and `run`. What loads slowly
+# (the numerical and plotting modules) is imported when it runs.
 _NAMES = (
     "import", "identify", "diagnose", "verify", "excite", "refit", "fleet", "simulate", "compensate", "learn", "export",
     "tune", "doctor", "call", "param", "calibrate", "experiments", "show",

@@ -11,6 +11,9 @@ from slpi_ros.errors import UsageError
 HELP = "identify, verify and follow many stages from many bags, on Dask"
 EXAMPLE = "slpi fleet bags -o fleet --workers 4"
 
+# Options that `slpi_ros.fleet.run` has under the same names.
+_PASSED_ON = "scheduler", "workers", "models", "since", "diagnose", "watch", "topic"
+
 
 def add_options(command: ArgumentParser) -> None:
     """Add the options of the command."""
@@ -30,7 +33,9 @@ def add_options(command: ArgumentParser) -> None:
     command.add_argument(
         "--since", metavar="DATE", help="only bags that begin at or after this date (UTC); default: all"
     )
-    command.add_argument("--no-diagnose", action="store_true", help="no search for causes of errors; default: search")
+    command.add_argument(
+        "--no-diagnose", dest="diagnose", action="store_false", help="no search for causes of errors; default: search"
+    )
     command.add_argument("--watch", action="store_true", help="go on with bags that are completed later; default: end")
     common.add_topic(command)
     common.add_with(command, "none; for a diagnosis every one that the bags hold")
@@ -51,14 +56,8 @@ def run(options: Namespace) -> Result:
         options.output,
         as_document=options.json,
         told=lambda text: print(text, file=sys.stderr),
-        scheduler=options.scheduler,
-        workers=options.workers,
-        models=options.models,
-        since=options.since,
-        diagnose=not options.no_diagnose,
-        watch=options.watch,
-        topic=options.topic,
         surroundings=options.quantities,
+        **{name: getattr(options, name) for name in _PASSED_ON},
     )
     text = "\n".join(lines)
     return Result(text.splitlines(), text, "slpi refit MODEL.json BAG... of a stage that has changed", passed=usable)

@@ -91,8 +91,7 @@ def run(options: Namespace) -> Result:
         if folder:
             write_files(folder, found)
         if folder and options.certificate:
-            of = certificates.Verified(found, done.records, options.bags, model, options.model)
-            certificates.write_files(folder, certificates.certificate(of))
+            certificates.write_files(folder, certificates.certificate(done, options.bags, model, options.model))
     if found.passed:
         next_command = f"slpi compensate {shlex.quote(options.model)} DESIRED.csv -o VOLTAGE.csv"
     elif found.verdict == UNPROVED and not any(done.independent):

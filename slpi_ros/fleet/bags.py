@@ -7,7 +7,7 @@ import json
 import time
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -80,14 +80,9 @@ class Row:
     page: str = ""
     seconds: float = 0.0
 
-    def to_document(self) -> dict[str, Any]:
-        """Return the row as JSON values."""
-        document = asdict(self)
-        return document | {"causes": list(self.causes), "findings": list(self.findings)}
-
     @classmethod
     def of_document(cls, document: Mapping[str, Any]) -> "Row":
-        """Return the row of a document written by `to_document`."""
+        """Return the row of a line of the journal, written with `asdict`."""
         return cls(**{**document, "causes": tuple(document["causes"]), "findings": tuple(document["findings"])})
 
 
@@ -104,13 +99,9 @@ class Examined:
     refused: Mapping[str, str] = field(default_factory=dict)  # reasons by axis; "": the whole bag
     seconds: float = 0.0  # computing time
 
-    def to_document(self) -> dict[str, Any]:
-        """Return the examination as JSON values."""
-        return asdict(self)
-
     @classmethod
     def of_document(cls, document: Mapping[str, Any]) -> "Examined":
-        """Return the examination of a document written by `to_document`."""
+        """Return the examination of a line of the journal, written with `asdict`."""
         told = {axis: tuple(texts) for axis, texts in document["findings"].items()}
         read = {"bag": Bag(**document["bag"]), "axes": tuple(document["axes"]), "findings": told}
         return cls(**{**document, **read})

@@ -8,6 +8,7 @@ import numpy as np
 from scipy import signal
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
+from slpi_ros.arrays.rates import slopes
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.design_matrix import Walk
 from slpi_ros.identification.drive import hold_band, resting, smallest_turn
@@ -84,7 +85,7 @@ class Motion:
         stops = np.unique(np.concatenate([[0], runs, _arrivals(v, runs), rests]))
         last = stops[np.searchsorted(stops, np.arange(v.size), side="right") - 1]
         branch_from = Walk.along(_monotone_between(v, runs), symmetric_rest=False, primed=False).v_origin
-        return cls(_speed(t, v), t - t[last], branch_from, runs)
+        return cls(slopes(t, v, _REACH), t - t[last], branch_from, runs)
 
 
 def _arrivals(v: FloatArray, runs: IntArray) -> IntArray:
@@ -103,13 +104,6 @@ def _monotone_between(v: FloatArray, runs: IntArray) -> FloatArray:
         further = np.maximum if v[stop] > v[start] else np.minimum
         clean[start : stop + 1] = further.accumulate(clean[start : stop + 1])
     return clean
-
-
-def _speed(t: FloatArray, v: FloatArray) -> FloatArray:
-    here = np.arange(v.size)
-    before, after = np.maximum(here - _REACH, 0), np.minimum(here + _REACH, v.size - 1)
-    step = t[after] - t[before]
-    return np.divide(v[after] - v[before], step, out=np.zeros(v.size), where=step > 0.0)
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import struct
 import threading
 import time
 from collections.abc import Sequence
+from typing import Any
 
 from pymodbus.constants import ExcCodes
 from pymodbus.server import ModbusTcpServer
@@ -48,12 +49,11 @@ class LabjackSimulator(SimulatedDevice):
     ----------
     axes : OUTPUT:INPUT or OUTPUT:INPUT:INPUT, as the driver's channels: how the stage is wired
     stage : what moves; by default a random one
-    voltages : at the outputs at the start, V
     gain : of the amplifier behind the outputs
     product : 7 or 8
     watchdog : values of its registers by their address
-    answer_delay : time until an answer, s
     port : TCP port; 0 for a free one
+    named : what every device has
     """
 
     usual_axes, usual_address = ("DAC0:AIN0",), "127.0.0.1:5020"
@@ -64,17 +64,14 @@ class LabjackSimulator(SimulatedDevice):
         axes: Sequence[str] = ("DAC0:AIN0",),
         stage: Stage | None = None,
         *,
-        voltages: Sequence[float] | None = None,
         gain: float = 20.0,
         product: int = 7,
         watchdog: dict[int, int] | None = None,
-        answer_delay: float = 0.0,
         host: str = "127.0.0.1",
         port: int = 0,
+        **named: Any,
     ) -> None:
-        super().__init__(
-            axes, stage, voltage_range=RANGES[product], voltages=voltages, gain=gain, answer_delay=answer_delay
-        )
+        super().__init__(axes, stage, voltage_range=RANGES[product], gain=gain, **named)
         self.watchdog = watchdog or {}
         self._product, self._host, self._port = product, host, port
         self._fault: Fault | None = None

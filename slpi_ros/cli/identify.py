@@ -5,7 +5,7 @@ from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Result, command_line, finding_lines, say
+from slpi_ros.cli.command import Result, finding_lines, say
 
 HELP = "identify the model of a stage from a bag"
 EXAMPLE = "slpi identify calibration -o model.json --report report"
@@ -66,8 +66,7 @@ def run(options: Namespace) -> Result:
             from slpi_ros.reports.identification import write_report
 
             truth = done.held_out()
-            part = {"start": source.start, "stop": source.stop}
-            write_report(folder, done.records[0], model, held_out=truth, found=found[0], **part)
+            write_report(folder, done.records[0], model, held_out=truth, found=found[0], **source.span)
             lines += [f"axis {axis}: {line}" for axis, held_out in truth.items() for line in held_out.lines()]
     if options.uncertainty:
         lines += [f"axis {axis}: {one.line()}" for axis, one in done.uncertainty().items()]
@@ -76,16 +75,7 @@ def run(options: Namespace) -> Result:
     warned = [line for one in found for line in finding_lines(one, all_levels=False)]
     told = [line for one in found for line in finding_lines(one)]
     if limits:
-        next_command = command_line(
-            "slpi",
-            "diagnose",
-            *options.bags,
-            "--model",
-            options.output,
-            "-o",
-            "diagnosis",
-            *common.same_record(options),
-        )
+        next_command = common.diagnosis_of(options, options.output)
     else:
         next_command = f"slpi verify OTHER_BAG --model {shlex.quote(options.output)}"
     return Result(

@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Result, command_line
+from slpi_ros.cli.command import Result
 from slpi_ros.errors import UsageError
 
 HELP = "test a model on bags not used to identify it: passed, failed or unproved"
@@ -97,9 +97,7 @@ def run(options: Namespace) -> Result:
     elif found.verdict == UNPROVED and not any(done.independent):
         next_command = f"slpi verify OTHER_BAG --model {shlex.quote(options.model)}"
     else:
-        next_command = command_line(
-            "slpi", "diagnose", *options.bags, "--model", options.model, "-o", "diagnosis", *common.same_record(options)
-        )
+        next_command = common.diagnosis_of(options, options.model)
     return Result(
         describe_verification(found, details=False),
         format_document(found.to_document(), "verification"),

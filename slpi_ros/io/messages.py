@@ -69,16 +69,13 @@ MESSAGE_TYPES = {
     "std_msgs/msg/Float64MultiArray": MessageType(False, False, ("data",), _read_array),
     "geometry_msgs/msg/Vector3Stamped": MessageType(True, True, ("vector",), _fixed("vector", names=_XYZ)),
 }
+_MEASURED = {"Temperature": "temperature", "RelativeHumidity": "relative_humidity", "FluidPressure": "fluid_pressure"}
 # Types of quantities that are recorded beside a stage.
 QUANTITY_TYPES = {
     # A variance follows the value.
     **{
         f"sensor_msgs/msg/{name}": MessageType(True, False, (field,), _fixed(field, "variance"))
-        for name, field in (
-            ("Temperature", "temperature"),
-            ("RelativeHumidity", "relative_humidity"),
-            ("FluidPressure", "fluid_pressure"),
-        )
+        for name, field in _MEASURED.items()
     },
     FLOAT64: MESSAGE_TYPES[FLOAT64],
     "geometry_msgs/msg/WrenchStamped": MessageType(

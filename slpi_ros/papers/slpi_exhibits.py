@@ -81,15 +81,8 @@ def separated(separation: Separation) -> Figure:
         panel.plot(v[loop.path], y[loop.path], ".-", color=DESIRED, markersize=3, linewidth=0.8)
         panel.plot(v[loop.vertex], y[loop.vertex], "^", color=COLOURS[0], markersize=9, label="vertex")
         if loop.joined.size:
-            panel.plot(
-                v[loop.joined],
-                y[loop.joined],
-                "o",
-                color=COLOURS[2],
-                markersize=9,
-                fillstyle="none",
-                label="joined here",
-            )
+            ring = {"color": COLOURS[2], "markersize": 9, "fillstyle": "none"}
+            panel.plot(v[loop.joined], y[loop.joined], "o", label="joined here", **ring)
         panel.set_title(f"level {ROMAN[loop.level]}", fontsize=11)
         panel.legend(frameon=False, loc="upper left")
         label_axes(panel, V, UM if panel is drawn[0] else "")

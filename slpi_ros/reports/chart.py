@@ -56,18 +56,18 @@ def thin_line(*signals: FloatArray, most: int = LINE_POINTS) -> IntArray:
         padded[:size] = signal
         rows = padded.reshape(stretches, length)
         offset = np.arange(stretches) * length
-        kept.append(_holes(signal, length))
+        first, after = sequences(np.isnan(signal))
+        kept.append(first[after - first >= length])
         kept += [offset + np.argmin(np.where(np.isnan(rows), np.inf, rows), axis=1)]
         kept += [offset + np.argmax(np.where(np.isnan(rows), -np.inf, rows), axis=1)]
     found = np.unique(np.concatenate(kept))
     return found[found < size]
 
 
-def _holes(signal: FloatArray, length: int) -> IntArray:
-    """Return the first sample of each sequence of at least `length` NaN in a signal, shape (N,)."""
-    missing = np.pad(np.isnan(signal), 1).astype(np.int8)
-    first, after = np.flatnonzero(np.diff(missing) > 0), np.flatnonzero(np.diff(missing) < 0)
-    return first[after - first >= length]
+def sequences(chosen: Mask) -> tuple[IntArray, IntArray]:
+    """Return the first sample of each sequence of `chosen` samples, shape (N,), and the sample after it."""
+    steps = np.diff(np.pad(chosen, 1).astype(np.int8))
+    return np.flatnonzero(steps > 0), np.flatnonzero(steps < 0)
 
 
 def thin_cloud(x: FloatArray, y: FloatArray, most: int = CLOUD_POINTS) -> IntArray:

@@ -32,6 +32,7 @@ from slpi_ros.reports.chart import (
     Chart,
     Panel,
     Quantity,
+    sequences,
     thin_cloud,
     thin_line,
 )
@@ -215,16 +216,17 @@ def over_time(
     # `noise` (m) is the half-width of the shaded band, 0: none. The text is a note on the number of samples outside the
     # initial view, or "".
     chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, ERROR, 1.2)], "column", 540)
-    for start, stop in _rows(np.zeros(t.size, dtype=bool) if fitted is None else ~fitted):
+    first, after = sequences(np.zeros(t.size, dtype=bool) if fitted is None else ~fitted)
+    for start, stop in zip(t[first].tolist(), t[np.minimum(after, t.size - 1)].tolist(), strict=True):
         for panel in (0, 1):
-            chart.span(panel, UNUSED, float(t[start]), float(t[stop]), UNUSED_SHADE)
+            chart.span(panel, UNUSED, start, stop, UNUSED_SHADE)
     left = [y - model.values for model in models]
     kept = thin_line(y, *left)
     chart.line(0, "measured", t[kept], y[kept], MEASURED, width=2.6)
     for model in models:
         chart.line(0, model.name, t[kept], model.values[kept], model.colour, width=1.0)
-    first, *others = zip(models, left, strict=True)
-    chart.line(1, first[0].name, t[kept], first[1][kept], first[0].colour, width=0.8)
+    (model, error), *others = zip(models, left, strict=True)
+    chart.line(1, model.name, t[kept], error[kept], model.colour, width=0.8)
     # Drawn above the total residual and below the smaller residuals.
     for part in parts:
         some = thin_line(part.values, most=LINE_POINTS // 2)
@@ -233,13 +235,6 @@ def over_time(
         chart.line(1, model.name, t[kept], error[kept], model.colour, width=0.8)
     chart.band(1, noise)
     return chart, focus(chart, (1,), left)
-
-
-def _rows(chosen: Mask) -> list[tuple[int, int]]:
-    """Return first and end sample of each sequence of `chosen` samples, shape (N,)."""
-    steps = np.diff(np.pad(chosen, 1).astype(np.int8))
-    first, after = np.flatnonzero(steps > 0), np.flatnonzero(steps < 0)
-    return list(zip(first.tolist(), np.minimum(after, chosen.size - 1).tolist(), strict=True))
 
 
 def over_voltage(v: FloatArray, left: FloatArray, motion: Motion, noise: float, fitted: Mask) -> tuple[Chart, str]:
@@ -389,11 +384,8 @@ def _means(x: FloatArray, values: FloatArray, *, alike: bool = False) -> tuple[F
 
 def _joined(lines: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
     """Return the lines concatenated, with NaN between them."""
-    gap = np.array([np.nan])
-    x, y = zip(*lines, strict=True)
-    return np.concatenate([part for one in x for part in (one, gap)]), np.concatenate(
-        [part for one in y for part in (one, gap)]
-    )
+    x, y = (np.concatenate([np.append(line, np.nan) for line in each]) for each in zip(*lines, strict=True))
+    return x, y
 
 
 def _rate(t: FloatArray) -> float:

@@ -6,7 +6,8 @@ import hashlib
 import json
 import time
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
@@ -433,14 +434,8 @@ def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-class _quiet:
+@contextmanager
+def _quiet() -> Iterator[None]:
     """Suppress warnings, and use one thread of the numerical libraries, within a ``with`` block."""
-
-    def __enter__(self) -> None:
-        self._warnings, self._threads = warnings.catch_warnings(), threadpool_limits(1)
-        self._warnings.__enter__()
-        warnings.simplefilter("ignore")
-
-    def __exit__(self, *_: object) -> None:
-        self._warnings.__exit__(None, None, None)
-        self._threads.restore_original_limits()
+    with warnings.catch_warnings(action="ignore"), threadpool_limits(1):
+        yield

@@ -139,6 +139,11 @@ class Chart:
             style |= {"mode": "lines+markers", "marker": {"color": colour, "size": width}}
         self._add(panel, name, x, y, {"type": "scatter", **style})
 
+    def thinned(self, panel: int, name: str, x: FloatArray, y: FloatArray, colour: str, *, width: float = 1.4) -> None:
+        """Add a line as `line` does, through about `LINE_POINTS` of the points."""
+        kept = thin_line(y)
+        self.line(panel, name, x[kept], y[kept], colour, width=width)
+
     def dots(self, panel: int, name: str, x: FloatArray, y: FloatArray, colour: str, *, faint: bool = False) -> None:
         """Add points, shape (N,) each, SI; `faint` points belong to a line of the same name, which is added later."""
         look = {"size": 3, "opacity": 0.3 if faint else 0.55} if x.size > _FEW else {"size": 8, "opacity": 1.0}
@@ -282,6 +287,11 @@ class Chart:
             if panel < len(self.panels) - 1 and here.x == self.panels[panel + 1].x:
                 across.update(title={"text": ""})
         return {f"xaxis{number}": across, f"yaxis{number}": up}
+
+
+def over_time(error: Quantity) -> Chart:
+    """Return an empty chart of the displacement over time, and of an error below."""
+    return Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, error, 1.2)], "column", 540)
 
 
 def _alone(y: FloatArray) -> Mask:

@@ -253,7 +253,7 @@ def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
     left = [Series(model.name, y - model.values, model.colour) for model in models]
     parts = _parts(traces)
     drawings = {
-        "time": views.over_time(t, y, models, found.noise_rms, parts),
+        "time": views.model_over_time(t, y, models, found.noise_rms, parts),
         "motion": views.over_motion(v, left, parts, motion),
         "frequency": views.over_frequency(t, left, parts, motion, found.noise_rms),
     }

@@ -10,19 +10,7 @@ from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.io.schemas import format_document
 from slpi_ros.model.axis_model import ABOVE_NOISE
 from slpi_ros.reports import views
-from slpi_ros.reports.chart import (
-    AFTER,
-    BEFORE,
-    DESIRED,
-    DISPLACEMENT,
-    MEASURED,
-    NOISE,
-    TIME,
-    Chart,
-    Panel,
-    Quantity,
-    thin_line,
-)
+from slpi_ros.reports.chart import AFTER, BEFORE, DESIRED, MEASURED, NOISE, Chart, Panel, Quantity, over_time, thin_line
 from slpi_ros.reports.chart import CAUSES as COLOURS
 from slpi_ros.reports.page import Page, Severity
 from slpi_ros.verification.step_answers import StepAnswer
@@ -398,7 +386,7 @@ def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
         [(PARTS[cause], f"{part * 1e9:.1f}", tracking.advice(cause)) for cause, part in _parts(tracking).items()],
         caption="Rms by which each part enters the whole; of parts that cancel, the smaller one is left out.",
     )
-    chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, TRACKING_ERROR, 1.2)], "column", 540)
+    chart = over_time(TRACKING_ERROR)
     error = tracking.whole
     t, desired = tracking.t, tracking.desired
     kept = thin_line(desired, error)
@@ -407,8 +395,7 @@ def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
     chart.line(1, "measured - desired", t[kept], error[kept], MEASURED, width=1.2)
     for cause, part in tracking.parts.items():
         if part.any():
-            some = thin_line(part)
-            chart.line(1, PARTS[cause], t[some], part[some], COLOUR[cause], width=1.0)
+            chart.thinned(1, PARTS[cause], t, part, COLOUR[cause], width=1.0)
     said = views.focus(chart, (1,), [error])
     show_steps(page, name, tracking.steps)
     page.chart(f"{name}-tracking", chart, f"Desired and measured displacement, and the parts of the error. {said}")

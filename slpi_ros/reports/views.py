@@ -32,6 +32,7 @@ from slpi_ros.reports.chart import (
     Chart,
     Panel,
     Quantity,
+    over_time,
     sequences,
     thin_cloud,
     thin_line,
@@ -131,7 +132,7 @@ def show_model(
     motion, models = Motion.of(t, v), [Series("model", simulated, AFTER)]
     chart, said = loops(v, y, models, motion, fitted)
     page.chart(f"{name}-loops", chart, f"{LOOPS} {said}")
-    chart, said = over_time(t, y, models, noise, fitted=fitted)
+    chart, said = model_over_time(t, y, models, noise, fitted=fitted)
     unused = "" if fitted.all() else f" Shaded: {UNUSED}."
     page.chart(f"{name}-time", chart, f"Over time; the grey band is plus or minus the repeatability.{unused} {said}")
     chart, said = over_voltage(v, y - simulated, motion, noise, fitted)
@@ -204,7 +205,7 @@ def _some_runs(v: FloatArray, y: FloatArray, motion: Motion) -> tuple[FloatArray
     return np.concatenate(samples), f"Of {count} branches one in {every} is drawn."
 
 
-def over_time(
+def model_over_time(
     t: FloatArray,
     y: FloatArray,
     models: Sequence[Series],
@@ -215,7 +216,7 @@ def over_time(
     """Draw displacement and residuals of models over time, with the `parts` of the first; not `fitted` is shaded."""
     # `noise` (m) is the half-width of the shaded band, 0: none. The text is a note on the number of samples outside the
     # initial view, or "".
-    chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, ERROR, 1.2)], "column", 540)
+    chart = over_time(ERROR)
     first, after = sequences(np.zeros(t.size, dtype=bool) if fitted is None else ~fitted)
     for start, stop in zip(t[first].tolist(), t[np.minimum(after, t.size - 1)].tolist(), strict=True):
         for panel in (0, 1):

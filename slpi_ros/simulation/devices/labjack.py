@@ -16,20 +16,8 @@ from pymodbus.constants import ExcCodes
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from slpi_ros.simulation.devices.base import (
-    ERROR,
-    HALF,
-    LATE,
-    LOST,
-    NONSENSE,
-    NOT_FINITE,
-    SILENT,
-    TWICE,
-    VOLTS_PER_METRE,
-    WRONG_AXIS,
-    Fault,
-    SimulatedDevice,
-)
+from slpi_ros.simulation.devices import base
+from slpi_ros.simulation.devices.base import Fault, SimulatedDevice
 from slpi_ros.simulation.stage import Stage
 
 # First register and number of registers of what is there.
@@ -149,19 +137,19 @@ class LabjackSimulator(SimulatedDevice):
         fault, self._fault = self._fault, None
         if fault is None:
             return data
-        if fault.kind == LATE:
+        if fault.kind == base.LATE:
             time.sleep(fault.seconds)
-        if fault.kind == LOST:
+        if fault.kind == base.LOST:
             self._refused_until = time.monotonic() + fault.seconds
             self._disconnect()
             return b""
         number = int.from_bytes(data[:2], "big")
         return {
-            SILENT: b"",
-            HALF: data[: len(data) // 2],
-            WRONG_AXIS: (number ^ 1).to_bytes(2, "big") + data[2:],
-            TWICE: data + data,
-            NONSENSE: b"\xff\x00<html>=1e\n" * 3,
+            base.SILENT: b"",
+            base.HALF: data[: len(data) // 2],
+            base.WRONG_AXIS: (number ^ 1).to_bytes(2, "big") + data[2:],
+            base.TWICE: data + data,
+            base.NONSENSE: b"\xff\x00<html>=1e\n" * 3,
         }.get(fault.kind, data)
 
     # Registers
@@ -173,7 +161,7 @@ class LabjackSimulator(SimulatedDevice):
         name = self._name_of(address)
         self.received.append(f"{'write' if values else 'read'} {name} {address} {count}")
         self._fault = self.due(name) if values is None else self.due("write")
-        if self._fault is not None and self._fault.kind == ERROR:
+        if self._fault is not None and self._fault.kind == base.ERROR:
             self._fault = None
             return ExcCodes.DEVICE_FAILURE
         if values is not None:
@@ -205,8 +193,8 @@ class LabjackSimulator(SimulatedDevice):
             return struct.pack(">f", self.voltage(self._outputs[address]))
         if address in self._inputs:
             axis, sensor = self._inputs[address]
-            value = measured[axis] * VOLTS_PER_METRE if sensor else self.voltage(axis)
-            if self._fault is not None and self._fault.kind == NOT_FINITE:
+            value = measured[axis] * base.VOLTS_PER_METRE if sensor else self.voltage(axis)
+            if self._fault is not None and self._fault.kind == base.NOT_FINITE:
                 value = float("nan")
             return struct.pack(">f", value)
         return struct.pack(">f", 0.0)

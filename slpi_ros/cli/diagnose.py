@@ -35,14 +35,7 @@ def run(options: Namespace) -> Result:
     from slpi_ros.io.bag_reader import require_different
     from slpi_ros.io.schemas import format_document
     from slpi_ros.model.document import load_model
-    from slpi_ros.reports.diagnosis import (
-        FILES,
-        PAGE,
-        describe_diagnosis,
-        diagnosis_good,
-        diagnosis_limits,
-        write_files,
-    )
+    from slpi_ros.reports import diagnosis as report
     from slpi_ros.reports.text import verdict
     from slpi_ros.workflows.diagnose import DiagnoseRequest, diagnose
 
@@ -50,16 +43,16 @@ def run(options: Namespace) -> Result:
     require_different(options.bags)
     model = common.with_sensor(load_model(options.model), options)
     # The model is not checked: an extended model may be extended again.
-    common.allow_folder(options, options.output, *FILES)
-    with output_folder(options.output, *FILES) as folder:
+    common.allow_folder(options, options.output, *report.FILES)
+    with output_folder(options.output, *report.FILES) as folder:
         done = diagnose(DiagnoseRequest(source, model))
         diagnosis = done.diagnosis
-        write_files(folder, diagnosis)
-    limits = diagnosis_limits(diagnosis)
+        report.write_files(folder, diagnosis)
+    limits = report.diagnosis_limits(diagnosis)
     found_any = any(found.effects for found in diagnosis.axes.values())
-    page = f"{folder / PAGE}: open it in a browser"
+    page = f"{folder / report.PAGE}: open it in a browser"
     warned = [line for found in done.findings for line in finding_lines(found, all_levels=False)]
-    described = describe_diagnosis(diagnosis)
+    described = report.describe_diagnosis(diagnosis)
     first = warned[:MOST_WARNINGS]
     lines = [*described[: MOST_LINES - 2 - len(first)], *first, page]
     if found_any or not limits:
@@ -72,6 +65,6 @@ def run(options: Namespace) -> Result:
         lines,
         format_document(diagnosis.to_document(), "diagnosis"),
         next_command,
-        verdict(limits, diagnosis_good(diagnosis)),
+        verdict(limits, report.diagnosis_good(diagnosis)),
         [*warned, *described, page],
     )

@@ -59,15 +59,8 @@ def run(options: Namespace) -> Result:
     from slpi_ros.io.schemas import format_document
     from slpi_ros.model.document import load_model
     from slpi_ros.reports import certificate as certificates
+    from slpi_ros.reports import verification as report
     from slpi_ros.reports.text import verdict
-    from slpi_ros.reports.verification import (
-        FILES,
-        describe_verification,
-        little_judged,
-        verification_good,
-        verification_limits,
-        write_files,
-    )
     from slpi_ros.verification.verify import UNPROVED
     from slpi_ros.workflows.verify import VerifyRequest, verify
 
@@ -79,7 +72,7 @@ def run(options: Namespace) -> Result:
     model = common.with_sensor(load_model(options.model), options)
     if options.certificate and options.output is None:
         raise UsageError("--certificate: give the folder that it is written into, -o DIR")
-    names = (*FILES, *certificates.FILES) if options.certificate else FILES
+    names = (*report.FILES, *certificates.FILES) if options.certificate else report.FILES
     if options.output is not None:
         common.allow_folder(options, options.output, *names, inputs=[options.model])
     with nullcontext() if options.output is None else output_folder(options.output, *names) as folder:
@@ -89,7 +82,7 @@ def run(options: Namespace) -> Result:
         done = verify(request)
         found = done.verification
         if folder:
-            write_files(folder, found)
+            report.write_files(folder, found)
         if folder and options.certificate:
             certificates.write_files(folder, certificates.certificate(done, options.bags, model, options.model))
     if found.passed:
@@ -99,10 +92,10 @@ def run(options: Namespace) -> Result:
     else:
         next_command = common.diagnosis_of(options, options.model)
     return Result(
-        describe_verification(found, details=False),
+        report.describe_verification(found, details=False),
         format_document(found.to_document(), "verification"),
         next_command,
-        verdict(verification_limits(found), verification_good(found)) + little_judged(found),
-        describe_verification(found),
+        verdict(report.verification_limits(found), report.verification_good(found)) + report.little_judged(found),
+        report.describe_verification(found),
         found.passed,
     )

@@ -173,16 +173,9 @@ def draw_compensation(study: Study, names: tuple[str, ...]) -> Figure:
 
 def exhibits(random: Study) -> list[Exhibit]:
     """Return the exhibits of the SLPI paper, from the given study of its random path and from further experiments."""
+    parts = _nonlinear_curve, _inclinations, _separation, _single_models, _closure, _classical, _inverse
     return [
-        _nonlinear_curve(random),
-        _inclinations(random),
-        _separation(random),
-        _single_models(random),
-        _closure(random),
-        _classical(random),
-        _inverse(random),
-        compensation(random),
-        straight_line(random),
+        *(part(random) for part in (*parts, compensation, straight_line)),
         other("Fig. 16 and 17: double inner loop, one vertex on the back branch", study(DOUBLE_INNER_LOOP)),
         other("Fig. 18 and 19: overlapped inner and outer loop", study(OVERLAPPED)),
         unseen(unseen_paths(random)),

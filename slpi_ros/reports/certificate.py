@@ -25,6 +25,7 @@ from slpi_ros.workflows.verify import VerifyOutcome
 
 SCHEMA = "slpi_ros/certificate/1"
 FILES = "certificate.json", "certificate.html"
+AXIS_FIGURES = "rms_m", "maximum_m", "rest_rms_m", "rest_maximum_m", "samples"
 PROGRAMS = "slpi_ros", "numpy", "scipy"
 METHOD = (
     "The voltage of each record is given to the model, and the displacement that it computes (free run, without any "
@@ -59,11 +60,7 @@ def certificate(done: VerifyOutcome, bags: Sequence[str], model: StageModel, mod
             name: {
                 "verdict": axis.verdict,
                 **_model(model.axes[name]),
-                "rms_m": axis.overall.rms,
-                "maximum_m": axis.overall.maximum,
-                "rest_rms_m": axis.rest.rms,
-                "rest_maximum_m": axis.rest.maximum,
-                "samples": axis.overall.samples,
+                **{figure: axis.to_document()[figure] for figure in AXIS_FIGURES},
                 "errors": [
                     _errors(one, model.surrounded(record).axes[name], _age(model, record))
                     for one, record in zip(axis.records, done.records, strict=True)

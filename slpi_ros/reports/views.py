@@ -277,11 +277,8 @@ def histogram(chart: Chart, panel: int, curve: Series) -> None:
         return
     low, high = float(x.min()), float(x.max())
     inner = float(np.subtract(*np.percentile(x, _INNER[::-1])))
-    classes = (
-        int(np.clip(np.ceil(_HISTOGRAM_CLASSES * (high - low) / inner), 1, 10 * _HISTOGRAM_CLASSES))
-        if inner > 0.0
-        else 1
-    )
+    classes = np.ceil(_HISTOGRAM_CLASSES * (high - low) / inner) if inner > 0.0 else 1.0
+    classes = int(np.clip(classes, 1, 10 * _HISTOGRAM_CLASSES))
     width = max((high - low) / classes, 1e-12)
     counts, edges = np.histogram(x, np.linspace(low - width, high + width, classes + 3))
     chart.steps(panel, curve.name, edges, counts.astype(np.float64), curve.colour)

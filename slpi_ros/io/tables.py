@@ -3,6 +3,7 @@
 import csv
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from io import StringIO
 from pathlib import Path
@@ -59,11 +60,9 @@ def import_table(
 def load_table(path: Path, options: ColumnOptions | None = None) -> Table:
     """Find the columns of a table by the content of its file; DependencyError if its library is missing."""
     given = options or ColumnOptions()
-    try:
-        with open_input(path, TABLE_BYTES) as file:
-            begin = file.read(8)
-    except OSError:
-        begin = b""
+    begin = b""
+    with suppress(OSError), open_input(path, TABLE_BYTES) as file:
+        begin = file.read(8)
     suffix = path.suffix.lower()
     if begin.startswith(_OLD_WORKBOOK):
         raise RecordError(f"{path}: a workbook of an old Excel; save it as .xlsx or CSV")

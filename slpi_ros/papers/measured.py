@@ -66,8 +66,7 @@ def score(folder: Path, case: Case, kind: str) -> Scores:
 
 def _rms(model: AxisModel, record: Record, start: float, stop: float) -> float:
     driven = np.isfinite(record.voltage["x"])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnidentifiedLoopWarning)
+    with warnings.catch_warnings(action="ignore", category=UnidentifiedLoopWarning):
         y = model.simulate(record.t[driven], record.voltage["x"][driven])
     error = y - record.displacement["x"][driven]
     t = record.t[driven]

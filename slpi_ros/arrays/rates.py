@@ -10,10 +10,10 @@ REACH = 2
 FAST_SHARE = 0.05
 
 
-def slopes(t: FloatArray, x: FloatArray) -> FloatArray:
-    """Return dx/dt, shape (N,), unit of `x` per second, by central differences over a few samples."""
+def slopes(t: FloatArray, x: FloatArray, reach: int = REACH) -> FloatArray:
+    """Return dx/dt, shape (N,), unit of `x` per second, by central differences over `reach` samples on either side."""
     at = np.arange(x.size)
-    before, after = np.maximum(at - REACH, 0), np.minimum(at + REACH, x.size - 1)
+    before, after = np.maximum(at - reach, 0), np.minimum(at + reach, x.size - 1)
     seconds = t[after] - t[before]
     return np.divide(x[after] - x[before], seconds, out=np.zeros(x.size), where=seconds > 0.0)
 

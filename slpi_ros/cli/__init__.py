@@ -9,58 +9,26 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import suppress
+from importlib import import_module
 from io import TextIOWrapper
+from keyword import iskeyword
 from typing import Any, NoReturn
 
-from slpi_ros.cli import (
-    calibrate,
-    call,
-    compensate,
-    diagnose,
-    doctor,
-    excite,
-    experiments,
-    export,
-    fleet,
-    identify,
-    import_,
-    learn,
-    param,
-    refit,
-    show,
-    simulate,
-    tune,
-    verify,
-)
-from slpi_ros.cli.command import MOST_LINES, Command, say
+from slpi_ros.cli.command import MOST_LINES, say
 from slpi_ros.errors import DependencyError, SlpiError, dependencies_needed, shown
 from slpi_ros.identification.progress import report_progress, shown_on
 
 __all__ = ["COMMANDS", "MOST_LINES", "main", "parser"]
 
-# Each imports its modules when it runs: the numerical and plotting modules load slowly.
-COMMANDS: Mapping[str, Command] = {
-    "import": import_.COMMAND,
-    "identify": identify.COMMAND,
-    "diagnose": diagnose.COMMAND,
-    "verify": verify.COMMAND,
-    "excite": excite.COMMAND,
-    "refit": refit.COMMAND,
-    "fleet": fleet.COMMAND,
-    "simulate": simulate.COMMAND,
-    "compensate": compensate.COMMAND,
-    "learn": learn.COMMAND,
-    "export": export.COMMAND,
-    "tune": tune.COMMAND,
-    "doctor": doctor.COMMAND,
-    "call": call.COMMAND,
-    "param": param.COMMAND,
-    "calibrate": calibrate.COMMAND,
-    "experiments": experiments.COMMAND,
-    "show": show.COMMAND,
-}
+# In the order of ``slpi --help``: each is a module with `HELP`, `EXAMPLE`, `add_options` and `run`. What loads slowly
+# (the numerical and plotting modules) is imported when it runs.
+_NAMES = (
+    "import", "identify", "diagnose", "verify", "excite", "refit", "fleet", "simulate", "compensate", "learn", "export",
+    "tune", "doctor", "call", "param", "calibrate", "experiments", "show",
+)  # fmt: skip
+COMMANDS = {name: import_module(f"slpi_ros.cli.{name}{'_' * iskeyword(name)}") for name in _NAMES}
 
 
 class _ShowVersion(argparse.Action):
@@ -100,13 +68,13 @@ def parser(command: str | None = None) -> argparse.ArgumentParser:
     for name, each in COMMANDS.items():
         own = commands.add_parser(
             name,
-            help=each.help,
-            description=f"{each.help[0].upper()}{each.help[1:]}.",
-            epilog=_epilog(each.example),
+            help=each.HELP,
+            description=f"{each.HELP[0].upper()}{each.HELP[1:]}.",
+            epilog=_epilog(each.EXAMPLE),
             formatter_class=argparse.RawDescriptionHelpFormatter,
         )
         if command in (None, name):
-            each.options(own)
+            each.add_options(own)
             own.add_argument("--json", action="store_true", help="print one JSON document, in SI units; default: text")
             own.add_argument("-v", "--verbose", action="store_true", help="print every line; default: the main ones")
     return whole

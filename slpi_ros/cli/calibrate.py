@@ -4,16 +4,21 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result, command_line
+from slpi_ros.cli.command import Result, command_line
+
+HELP = "print how to let a stage calibrate itself"
+EXAMPLE = "slpi calibrate -o my_stage --voltage-min 0 --voltage-max 100"
 
 
-def _add_options(command: ArgumentParser) -> None:
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     command.add_argument("-o", "--output", metavar="DIR", required=True, help="folder of bags, model and page")
     common.add_axes(command, default=("x",), help="default: x")
     common.add_limits(command, "slew limit")
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.excitation.legs import DriveSpec
 
     common.require_axis_names(options.axis)
@@ -34,11 +39,3 @@ def _run(options: Namespace) -> Result:
         {"command": command},
         command_line("slpi", "show", Path(options.output) / "model.json"),
     )
-
-
-COMMAND = Command(
-    "print how to let a stage calibrate itself",
-    "slpi calibrate -o my_stage --voltage-min 0 --voltage-max 100",
-    _add_options,
-    _run,
-)

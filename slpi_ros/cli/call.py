@@ -3,7 +3,10 @@
 from argparse import ArgumentParser, Namespace
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result, command_line, say
+from slpi_ros.cli.command import Result, command_line, say
+
+HELP = "call a service of a running node, such as arm or reset_memory, and say first what that moves"
+EXAMPLE = "slpi call /compensator arm"
 
 # What each service of the nodes moves.
 MOVES = {
@@ -23,7 +26,8 @@ UNKNOWN = "what the node does with it, which is not known here"
 PATIENCE = 300.0
 
 
-def _add_options(command: ArgumentParser) -> None:
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     command.add_argument("node", metavar="NODE", help="name of the node, as /compensator")
     command.add_argument("service", metavar="SERVICE", help=f"one of its services: {', '.join(MOVES)}")
     command.add_argument(
@@ -32,7 +36,8 @@ def _add_options(command: ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.nodes.graph_calls import NodeCalls, joined
 
     service = options.service.removeprefix("~/")
@@ -45,11 +50,3 @@ def _run(options: Namespace) -> Result:
     document = {"node": options.node, "service": service, "moves": moves, "success": success, "message": message}
     following = command_line("slpi", "doctor") if success else "see what it says, and /diagnostics"
     return Result([], document, following, f"{'done' if success else 'FAILED'}: {message or service}", passed=success)
-
-
-COMMAND = Command(
-    "call a service of a running node, such as arm or reset_memory, and say first what that moves",
-    "slpi call /compensator arm",
-    _add_options,
-    _run,
-)

@@ -1,12 +1,11 @@
-"""What a command is, what it has to say, and how that is printed."""
+"""What a command has to say, and how that is printed."""
 
 import json
 import math
 import os
 import shlex
 import sys
-from argparse import ArgumentParser, Namespace
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -78,13 +77,3 @@ def finding_lines(found: "Findings", *, all_levels: bool = True) -> list[str]:
         for finding in own
         if all_levels or finding.level != "ok"
     ]
-
-
-@dataclass(frozen=True)
-class Command:
-    """One command: help text, example, function that adds its options to a parser, and function that runs it."""
-
-    help: str
-    example: str
-    options: Callable[[ArgumentParser], None]
-    run: Callable[[Namespace], Result]

@@ -5,14 +5,18 @@ from argparse import ArgumentParser, Namespace
 from typing import Any
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result, command_line
+from slpi_ros.cli.command import Result, command_line
 from slpi_ros.errors import SlpiError, UsageError
+
+HELP = "compute the voltage for a desired displacement"
+EXAMPLE = "slpi compensate model.json desired.csv -o voltage.csv --slew-limit 1000"
 
 # A first voltage that differs by more than this share of the range is told as a jump.
 SMALLEST_JUMP = 1e-3
 
 
-def _add_options(command: ArgumentParser) -> None:
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     from slpi_ros.model.axis_model import START_MEMORIES
 
     command.add_argument("model", metavar="MODEL.json", help="model of the stage")
@@ -33,7 +37,8 @@ def _add_options(command: ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     import numpy as np
 
     from slpi_ros.io.outputs import allow_table
@@ -85,11 +90,3 @@ def _run(options: Namespace) -> Result:
             "voltage_range_V": [float(v.min()), float(v.max())],
         }  # fmt: skip
     return Result(lines, document, command_line("slpi", "simulate", options.model, options.output, "-o", "REACHED.csv"))
-
-
-COMMAND = Command(
-    "compute the voltage for a desired displacement",
-    "slpi compensate model.json desired.csv -o voltage.csv --slew-limit 1000",
-    _add_options,
-    _run,
-)

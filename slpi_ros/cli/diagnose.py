@@ -5,13 +5,17 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import MOST_LINES, Command, Result, finding_lines
+from slpi_ros.cli.command import MOST_LINES, Result, finding_lines
+
+HELP = "find the causes of a model's errors on bags and extend the model"
+EXAMPLE = "slpi diagnose calibration check --model model.json -o diagnosis"
 
 # Largest number of warnings on the records without -v.
 MOST_WARNINGS = 3
 
 
-def _add_options(command: ArgumentParser) -> None:
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     common.add_bags(command, "; several records allow cross-validation of each cause")
     command.add_argument("--model", metavar="MODEL.json", required=True, help="of the same stage")
     common.add_output(command, "DIR", "folder of diagnosis.json, extended_model.json and report.html")
@@ -25,19 +29,13 @@ def _add_options(command: ArgumentParser) -> None:
     common.add_sensor(command)
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.io.bag_reader import require_different
     from slpi_ros.io.schemas import format_document
     from slpi_ros.model.document import load_model
-    from slpi_ros.reports.diagnosis import (
-        FILES,
-        PAGE,
-        describe_diagnosis,
-        diagnosis_good,
-        diagnosis_limits,
-        write_files,
-    )
+    from slpi_ros.reports import diagnosis as report
     from slpi_ros.reports.text import verdict
     from slpi_ros.workflows.diagnose import DiagnoseRequest, diagnose
 
@@ -45,16 +43,16 @@ def _run(options: Namespace) -> Result:
     require_different(options.bags)
     model = common.with_sensor(load_model(options.model), options)
     # The model is not checked: an extended model may be extended again.
-    common.allow_folder(options, options.output, *FILES)
-    with output_folder(options.output, *FILES) as folder:
+    common.allow_folder(options, options.output, *report.FILES)
+    with output_folder(options.output, *report.FILES) as folder:
         done = diagnose(DiagnoseRequest(source, model))
         diagnosis = done.diagnosis
-        write_files(folder, diagnosis)
-    limits = diagnosis_limits(diagnosis)
+        report.write_files(folder, diagnosis)
+    limits = report.diagnosis_limits(diagnosis)
     found_any = any(found.effects for found in diagnosis.axes.values())
-    page = f"{folder / PAGE}: open it in a browser"
+    page = f"{folder / report.PAGE}: open it in a browser"
     warned = [line for found in done.findings for line in finding_lines(found, all_levels=False)]
-    described = describe_diagnosis(diagnosis)
+    described = report.describe_diagnosis(diagnosis)
     first = warned[:MOST_WARNINGS]
     lines = [*described[: MOST_LINES - 2 - len(first)], *first, page]
     if found_any or not limits:
@@ -67,14 +65,6 @@ def _run(options: Namespace) -> Result:
         lines,
         format_document(diagnosis.to_document(), "diagnosis"),
         next_command,
-        verdict(limits, diagnosis_good(diagnosis)),
+        verdict(limits, report.diagnosis_good(diagnosis)),
         [*warned, *described, page],
     )
-
-
-COMMAND = Command(
-    "find the causes of a model's errors on bags and extend the model",
-    "slpi diagnose calibration check --model model.json -o diagnosis",
-    _add_options,
-    _run,
-)

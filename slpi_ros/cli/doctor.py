@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result, command_line
+from slpi_ros.cli.command import Result, command_line
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.progress import report_progress
 
@@ -18,6 +18,9 @@ if TYPE_CHECKING:
     from slpi_ros.drivers.base import Device
     from slpi_ros.reports.doctor import Check
 
+HELP = "check bags, a model, a device and a running ROS graph, and say what to do"
+EXAMPLE = "slpi doctor calibration --model model.json"
+
 COMMANDS_TOPIC = "voltage_command"
 # Longest time to watch a running graph, seconds.
 LONGEST_WATCH = 3600.0
@@ -25,7 +28,8 @@ LONGEST_WATCH = 3600.0
 TIMED = 21
 
 
-def _add_options(command: ArgumentParser) -> None:
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     command.add_argument("bags", metavar="BAG", nargs="*", help="records to be checked; default: none")
     command.add_argument("--model", metavar="MODEL.json", help="model to be checked; default: that on stage_model")
     command.add_argument("--voltage-min", metavar="V", type=float, help="lowest voltage allowed; default: not checked")
@@ -52,22 +56,13 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument("--no-ros", action="store_true", help="check the files only; default: also a running graph")
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from importlib.util import find_spec
 
     from slpi_ros.io.bag_reader import read_bag
     from slpi_ros.model.document import load_model
-    from slpi_ros.reports.doctor import (
-        FAILED,
-        NOTE,
-        Check,
-        check_graph,
-        check_model,
-        check_record,
-        described,
-        doctor_document,
-        worst_first,
-    )
+    from slpi_ros.reports import doctor as report
 
     limits = None
     if (options.voltage_min is None) != (options.voltage_max is None):
@@ -82,40 +77,42 @@ def _run(options: Namespace) -> Result:
     if options.model:
         try:
             model = load_model(options.model)
-            checks += check_model(model, limits)
+            checks += report.check_model(model, limits)
         except SlpiError as error:
-            checks.append(Check(FAILED, str(error)))
+            checks.append(report.Check(report.FAILED, str(error)))
     for bag in options.bags:
         report_progress(f"reading {bag}")
         try:
-            checks += check_record(read_bag(bag, options.topic), model, limits)
+            checks += report.check_record(read_bag(bag, options.topic), model, limits)
         except SlpiError as error:
-            checks.append(Check(FAILED, str(error)))
+            checks.append(report.Check(report.FAILED, str(error)))
     table: list[str] = []
     if options.device:
         told, table = _read_device(options.device, options.channels)
         checks += told
     if options.device:
-        checks.append(Check(NOTE, "ROS: not checked beside a device, which serves one program at a time"))
+        checks.append(report.Check(report.NOTE, "ROS: not checked beside a device, which serves one program at a time"))
     elif options.no_ros or find_spec("rclpy") is None:
         why = "--no-ros" if options.no_ros else "no rclpy; source the setup file of ROS 2 to check a running graph"
-        checks.append(Check(NOTE if files or options.no_ros else FAILED, f"ROS: not checked: {why}"))
+        checks.append(
+            report.Check(report.NOTE if files or options.no_ros else report.FAILED, f"ROS: not checked: {why}")
+        )
     else:
         from slpi_ros.nodes.graph_probe import probe
 
         report_progress("watching the ROS graph")
         graph = probe(options.topic, options.command_topic, options.namespace, options.seconds)
         if graph.nodes or not files:
-            checks += check_graph(graph, model)
+            checks += report.check_graph(graph, model)
         else:
-            checks.append(Check(NOTE, "ROS: no node is running; only the files were checked"))
-    verdict, lines, details = described(checks)
+            checks.append(report.Check(report.NOTE, "ROS: no node is running; only the files were checked"))
+    verdict, lines, details = report.described(checks)
     if table:
         # All of it, as the YAML is to be copied.
         lines, details, verdict = [verdict, *table, *lines], [verdict, *table, *details], ""
-    well = not any(check.level == FAILED for check in checks)
+    well = not any(check.level == report.FAILED for check in checks)
     if not well:
-        failed = [check for check in worst_first(checks) if check.level == FAILED]
+        failed = [check for check in report.worst_first(checks) if check.level == report.FAILED]
         next_command = next((check for check in failed if "; " in check.text), failed[0]).remedy
     elif options.device:
         next_command = "ros2 run slpi_ros driver --ros-args --params-file driver.yaml"
@@ -127,7 +124,7 @@ def _run(options: Namespace) -> Result:
         next_command = f"slpi verify OTHER_BAG --model {shlex.quote(options.model)}"
     else:
         next_command = "slpi calibrate -o DIR --voltage-min V --voltage-max V"
-    return Result(lines, doctor_document(checks), next_command, verdict, details, well)
+    return Result(lines, report.doctor_document(checks), next_command, verdict, details, well)
 
 
 def _read_device(device: str, channels: Sequence[str]) -> "tuple[list[Check], list[str]]":
@@ -165,11 +162,3 @@ def _cycle_of(device: "Device") -> "tuple[float, FloatArray]":
         positions.append(device.read().positions)
         times.append(time.perf_counter() - begun)
     return statistics.median(times), np.array(positions)
-
-
-COMMAND = Command(
-    "check bags, a model, a device and a running ROS graph, and say what to do",
-    "slpi doctor calibration --model model.json",
-    _add_options,
-    _run,
-)

@@ -4,16 +4,20 @@ from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result
+from slpi_ros.cli.command import Result
 from slpi_ros.errors import SlpiError, UsageError
 
 if TYPE_CHECKING:
     from slpi_ros.arrays import FloatArray
 
+HELP = "generate excitation voltages for an identification"
+EXAMPLE = "slpi excite -o drive.csv --voltage-min 0 --voltage-max 100"
+
 RATE = 200.0
 
 
-def _add_options(command: ArgumentParser) -> None:
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     from slpi_ros.excitation.drives import DRIVES
 
     common.add_output(command, "DRIVE.csv", "columns time_s, <axis>_V")
@@ -46,7 +50,8 @@ def _add_options(command: ArgumentParser) -> None:
     )  # fmt: skip
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     import numpy as np
 
     from slpi_ros.arrays.rates import fastest
@@ -130,11 +135,3 @@ def _path_of(options: Namespace) -> tuple[dict[str, "FloatArray"], float]:
         volts = {axis: low + span * (y - y.min()) / (float(np.ptp(y)) or 1.0) for axis, y in desired.items()}
     even = np.arange(int(t[-1] * rate) + 1) / rate
     return {axis: np.interp(even, t, v) for axis, v in volts.items()}, rate
-
-
-COMMAND = Command(
-    "generate excitation voltages for an identification",
-    "slpi excite -o drive.csv --voltage-min 0 --voltage-max 100",
-    _add_options,
-    _run,
-)

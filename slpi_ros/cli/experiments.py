@@ -4,18 +4,23 @@ from argparse import ArgumentParser, Namespace
 from pathlib import Path
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result
+from slpi_ros.cli.command import Result
 from slpi_ros.errors import UsageError
 
+HELP = "reproduce the tables and figures of the two papers"
+EXAMPLE = "slpi experiments -o experiments"
 
-def _add_options(command: ArgumentParser) -> None:
+
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     common.add_output(command, "DIR", "folder of index.html")
     command.add_argument(
         "--data", metavar="DIR", help="folder of measured records to include in the comparison; default: none"
     )
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.io.outputs import allow_folder
     from slpi_ros.papers.page import COLUMNS, PAGE, TABLE, write_experiments
 
@@ -25,8 +30,3 @@ def _run(options: Namespace) -> Result:
     options.remarks += allow_folder(options.output, PAGE, tables={TABLE: COLUMNS}, overwrite=options.overwrite)
     page = write_experiments(Path(options.output), data)
     return Result([f"{page}: the tables and figures"], {"page": str(page)}, f"open {page} in a browser")
-
-
-COMMAND = Command(
-    "reproduce the tables and figures of the two papers", "slpi experiments -o experiments", _add_options, _run
-)

@@ -4,11 +4,15 @@ import math
 from argparse import ArgumentParser, Namespace
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result
+from slpi_ros.cli.command import Result
 from slpi_ros.errors import UsageError
 
+HELP = "write the causal inverse of a model as C source or as an FMU"
+EXAMPLE = "slpi export model.json -o controller --slew-limit 1000"
 
-def _add_options(command: ArgumentParser) -> None:
+
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     from slpi_ros.export.targets import TARGETS
 
     command.add_argument("model", metavar="MODEL.json", help="model of the stage")
@@ -27,7 +31,8 @@ def _add_options(command: ArgumentParser) -> None:
     )
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.export.stage import ExportedStage
     from slpi_ros.export.targets import TARGETS
     from slpi_ros.model.document import load_model
@@ -57,11 +62,3 @@ def _run(options: Namespace) -> Result:
         },
     }  # fmt: skip
     return Result(lines, document, target.next(options.output), f"wrote {', '.join(names)}")
-
-
-COMMAND = Command(
-    "write the causal inverse of a model as C source or as an FMU",
-    "slpi export model.json -o controller --slew-limit 1000",
-    _add_options,
-    _run,
-)

@@ -5,11 +5,18 @@ import sys
 from argparse import ArgumentParser, Namespace
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result
+from slpi_ros.cli.command import Result
 from slpi_ros.errors import UsageError
 
+HELP = "identify, verify and follow many stages from many bags, on Dask"
+EXAMPLE = "slpi fleet bags -o fleet --workers 4"
 
-def _add_options(command: ArgumentParser) -> None:
+# Options that `slpi_ros.fleet.run` has under the same names.
+_PASSED_ON = "scheduler", "workers", "models", "since", "diagnose", "watch", "topic"
+
+
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     command.add_argument(
         "sources", metavar="SOURCE", nargs="+", help="bag, folder of bags (recursively), or CSV list of bag and stage"
     )
@@ -26,13 +33,16 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument(
         "--since", metavar="DATE", help="only bags that begin at or after this date (UTC); default: all"
     )
-    command.add_argument("--no-diagnose", action="store_true", help="no search for causes of errors; default: search")
+    command.add_argument(
+        "--no-diagnose", dest="diagnose", action="store_false", help="no search for causes of errors; default: search"
+    )
     command.add_argument("--watch", action="store_true", help="go on with bags that are completed later; default: end")
     common.add_topic(command)
     common.add_with(command, "none; for a diagnosis every one that the bags hold")
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.fleet.pages import DOCUMENT, PAGE, report_fleet
     from slpi_ros.fleet.results import JOURNAL, TABLE
     from slpi_ros.io.outputs import allow_folder
@@ -46,22 +56,8 @@ def _run(options: Namespace) -> Result:
         options.output,
         as_document=options.json,
         told=lambda text: print(text, file=sys.stderr),
-        scheduler=options.scheduler,
-        workers=options.workers,
-        models=options.models,
-        since=options.since,
-        diagnose=not options.no_diagnose,
-        watch=options.watch,
-        topic=options.topic,
         surroundings=options.quantities,
+        **{name: getattr(options, name) for name in _PASSED_ON},
     )
     text = "\n".join(lines)
     return Result(text.splitlines(), text, "slpi refit MODEL.json BAG... of a stage that has changed", passed=usable)
-
-
-COMMAND = Command(
-    "identify, verify and follow many stages from many bags, on Dask",
-    "slpi fleet bags -o fleet --workers 4",
-    _add_options,
-    _run,
-)

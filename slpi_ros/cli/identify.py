@@ -5,10 +5,14 @@ from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result, command_line, finding_lines, say
+from slpi_ros.cli.command import Result, command_line, finding_lines, say
+
+HELP = "identify the model of a stage from a bag"
+EXAMPLE = "slpi identify calibration -o model.json --report report"
 
 
-def _add_options(command: ArgumentParser) -> None:
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     from slpi_ros.identification.fit import KINDS
 
     common.add_bags(command)
@@ -33,7 +37,8 @@ def _add_options(command: ArgumentParser) -> None:
     )
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.model.document import format_model, save_model
     from slpi_ros.model.sensor import Sensor
@@ -61,8 +66,7 @@ def _run(options: Namespace) -> Result:
             from slpi_ros.reports.identification import write_report
 
             truth = done.held_out()
-            part = {"start": source.start, "stop": source.stop}
-            write_report(folder, done.records[0], model, held_out=truth, found=found[0], **part)
+            write_report(folder, done.records[0], model, held_out=truth, found=found[0], **source.span)
             lines += [f"axis {axis}: {line}" for axis, held_out in truth.items() for line in held_out.lines()]
     if options.uncertainty:
         lines += [f"axis {axis}: {one.line()}" for axis, one in done.uncertainty().items()]
@@ -71,16 +75,7 @@ def _run(options: Namespace) -> Result:
     warned = [line for one in found for line in finding_lines(one, all_levels=False)]
     told = [line for one in found for line in finding_lines(one)]
     if any(map(unexplained, limits.values())):
-        next_command = command_line(
-            "slpi",
-            "diagnose",
-            *options.bags,
-            "--model",
-            options.output,
-            "-o",
-            "diagnosis",
-            *common.same_record(options),
-        )
+        next_command = common.diagnosis_of(options, options.output)
     elif limits:
         next_command = command_line("slpi", "doctor", *options.bags)
     else:
@@ -92,11 +87,3 @@ def _run(options: Namespace) -> Result:
         verdict(limits, model_good(model)),
         [*told, *lines, *describe_model(model)],
     )
-
-
-COMMAND = Command(
-    "identify the model of a stage from a bag",
-    "slpi identify calibration -o model.json --report report",
-    _add_options,
-    _run,
-)

@@ -2,13 +2,17 @@
 
 import os
 from argparse import ArgumentParser, Namespace
-from dataclasses import replace
+from dataclasses import fields, replace
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result, command_line
+from slpi_ros.cli.command import Result, command_line
+
+HELP = "turn a table of measured data into a bag"
+EXAMPLE = "slpi import data.csv -o calibration"
 
 
-def _add_options(command: ArgumentParser) -> None:
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     command.add_argument(
         "table", metavar="DATA",
         help="text (.csv, .txt, .lvm, ..), .mat, .npz, .xlsx or .tdms; names include the unit: x_nm, x (nm), x [nm] or "
@@ -64,26 +68,14 @@ def _add_options(command: ArgumentParser) -> None:
     )
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.io.bag_writer import write_bag
     from slpi_ros.io.columns import ColumnOptions
     from slpi_ros.io.outputs import allow_bag
     from slpi_ros.io.tables import import_with_summary
 
-    columns = ColumnOptions(
-        time=options.time,
-        voltage=tuple(options.voltage),
-        displacement=tuple(options.displacement),
-        displacement_unit=options.displacement_unit,
-        axes=tuple(options.axes),
-        desired=tuple(options.desired),
-        sample_period=options.sample_period,
-        sensor_scale=options.sensor_scale,
-        amplifier_gain=options.amplifier_gain,
-        names=tuple(options.names),
-        sheet=options.sheet,
-        group=options.group,
-    )
+    columns = ColumnOptions(**{each.name: getattr(options, each.name) for each in fields(ColumnOptions)})
     options.remarks += allow_bag(options.output, overwrite=options.overwrite)
     table = import_with_summary(options.table, columns)
     record = replace(table.record, hardware_id=options.hardware_id)
@@ -101,6 +93,3 @@ def _run(options: Namespace) -> Result:
         },
         command_line("slpi", "identify", options.output, "-o", "model.json"),
     )
-
-
-COMMAND = Command("turn a table of measured data into a bag", "slpi import data.csv -o calibration", _add_options, _run)

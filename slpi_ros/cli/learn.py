@@ -6,11 +6,15 @@ from contextlib import nullcontext
 from pathlib import Path
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result, command_line
+from slpi_ros.cli.command import Result, command_line
 from slpi_ros.errors import UsageError
 
+HELP = "compute the next pass of a path that repeats, from the bags of its passes"
+EXAMPLE = "slpi learn passes --model model.json --learned path.json -o next.csv"
 
-def _add_options(command: ArgumentParser) -> None:
+
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     common.add_bags(command, ", with one pass or more of the path, in any order")
     command.add_argument(
         "--model", metavar="MODEL.json", required=True, help="model with which the path is compensated"
@@ -39,7 +43,8 @@ def _add_options(command: ArgumentParser) -> None:
     common.add_span(command, "the passes")
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.io.outputs import allow_document, allow_table
     from slpi_ros.io.tables import read_table, table_header, write_table
@@ -88,11 +93,3 @@ def _run(options: Namespace) -> Result:
     return Result(
         lines, document, command_line("slpi", "compensate", options.model, options.output, "-o", "VOLTAGE.csv")
     )
-
-
-COMMAND = Command(
-    "compute the next pass of a path that repeats, from the bags of its passes",
-    "slpi learn passes --model model.json --learned path.json -o next.csv",
-    _add_options,
-    _run,
-)

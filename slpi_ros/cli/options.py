@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from slpi_ros.cli.command import command_line
 from slpi_ros.errors import SlpiError, UsageError
 
 # Each command imports its modules when it runs: the numerical and plotting modules load slowly.
@@ -247,6 +248,12 @@ def same_record(options: Namespace) -> list[str]:
     if options.axis:
         words += ["--axis", *options.axis]
     return words
+
+
+def diagnosis_of(options: Namespace, model: str) -> str:
+    """Return the command that diagnoses a model on the same records."""
+    words = ["--model", model, "-o", "diagnosis", *same_record(options)]
+    return command_line("slpi", "diagnose", *options.bags, *words)
 
 
 def require_axis_names(axes: Sequence[str]) -> None:

@@ -4,10 +4,14 @@ import json
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
-from slpi_ros.cli.command import Command, Result, command_line
+from slpi_ros.cli.command import Result, command_line
+
+HELP = "show or set a parameter of a running node"
+EXAMPLE = "slpi param /compensator feedback true"
 
 
-def _add_options(command: ArgumentParser) -> None:
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     command.add_argument("node", metavar="NODE", help="name of the node, as /compensator")
     command.add_argument("name", metavar="NAME", help="name of the parameter")
     command.add_argument(
@@ -15,7 +19,8 @@ def _add_options(command: ArgumentParser) -> None:
     )
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.nodes.graph_calls import NodeCalls, joined
 
     with joined("slpi_param") as (node, executor):
@@ -37,11 +42,3 @@ def _listed(value: Any) -> Any:
 
 def _shown(value: Any) -> str:
     return value if isinstance(value, str) else json.dumps(_listed(value))
-
-
-COMMAND = Command(
-    "show or set a parameter of a running node",
-    "slpi param /compensator feedback true",
-    _add_options,
-    _run,
-)

@@ -7,13 +7,17 @@ from dataclasses import replace
 from typing import TYPE_CHECKING
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result
+from slpi_ros.cli.command import Result
 
 if TYPE_CHECKING:
     from slpi_ros.identification.refit import AxisChange
 
+HELP = "update a model with new bags, keeping regions that these do not visit"
+EXAMPLE = "slpi refit model.json monday -o model.json"
 
-def _add_options(command: ArgumentParser) -> None:
+
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     command.add_argument("model", metavar="MODEL.json", help="model to be corrected")
     command.add_argument("bags", metavar="BAG", nargs="+", help="in any order; the oldest record is used first")
     common.add_output(command, "MODEL.json", "may be the input model file")
@@ -28,7 +32,8 @@ def _add_options(command: ArgumentParser) -> None:
     )
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.model.document import load_model, save_model
     from slpi_ros.reports.text import change_limits, describe_change, verdict
@@ -74,11 +79,3 @@ def _numbers(change: "AxisChange") -> dict[str, float | bool | None]:
         "offset_uncertainty_m": match.offset_uncertainty,
         "zero_moved": bool(match.zero_moved),
     }
-
-
-COMMAND = Command(
-    "update a model with new bags, keeping regions that these do not visit",
-    "slpi refit model.json monday -o model.json",
-    _add_options,
-    _run,
-)

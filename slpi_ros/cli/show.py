@@ -3,14 +3,19 @@
 import shlex
 from argparse import ArgumentParser, Namespace
 
-from slpi_ros.cli.command import Command, Result
+from slpi_ros.cli.command import Result
+
+HELP = "print the contents of a model"
+EXAMPLE = "slpi show model.json"
 
 
-def _add_options(command: ArgumentParser) -> None:
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     command.add_argument("model", metavar="MODEL.json", help="model to be shown")
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.model.document import format_model, load_model
     from slpi_ros.reports.text import describe_model, model_good, model_limits, unexplained, verdict
     from slpi_ros.reports.uncertainty import describe_uncertainty
@@ -33,6 +38,3 @@ def _run(options: Namespace) -> Result:
         verdict(limits, model_good(model)),
         [*describe_model(model), *uncertain(details=True)],
     )
-
-
-COMMAND = Command("print the contents of a model", "slpi show model.json", _add_options, _run)

@@ -3,10 +3,14 @@
 from argparse import ArgumentParser, Namespace
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result, command_line
+from slpi_ros.cli.command import Result, command_line
+
+HELP = "compute the displacement for a voltage"
+EXAMPLE = "slpi simulate model.json voltage.csv -o displacement.csv"
 
 
-def _add_options(command: ArgumentParser) -> None:
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     command.add_argument("model", metavar="MODEL.json", help="model of the stage")
     command.add_argument(
         "table",
@@ -16,7 +20,8 @@ def _add_options(command: ArgumentParser) -> None:
     common.add_output(command, "DISPLACEMENT.csv", "columns time_s, <axis>_m")
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.io.outputs import allow_table
     from slpi_ros.io.tables import read_table_with, table_header, write_table
     from slpi_ros.model.document import load_model
@@ -43,11 +48,3 @@ def _run(options: Namespace) -> Result:
         {"table": options.output, "samples": t.size, "displacement_range_m": {a: list(r) for a, r in ranges.items()}},
         command_line("slpi", "compensate", options.model, options.output, "-o", "VOLTAGE.csv"),
     )
-
-
-COMMAND = Command(
-    "compute the displacement for a voltage",
-    "slpi simulate model.json voltage.csv -o displacement.csv",
-    _add_options,
-    _run,
-)

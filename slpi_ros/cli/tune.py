@@ -4,12 +4,16 @@ from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result, command_line
+from slpi_ros.cli.command import Result, command_line
+
+HELP = "gains and notches of the feedback from a model"
+EXAMPLE = "slpi tune model.json -o gains.yaml --rate 2000"
 
 RATE, MARGIN = 1000.0, 0.5
 
 
-def _add_options(command: ArgumentParser) -> None:
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     command.add_argument("model", metavar="MODEL.json", help="model of the stage")
     command.add_argument(
         "bags", metavar="BAG", nargs="?", help="record of a drive by slpi excite --for-response; default: none"
@@ -29,7 +33,8 @@ def _add_options(command: ArgumentParser) -> None:
     command.add_argument("--report", metavar="DIR", help="also write a page with the loop's plots; default: none")
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.compensator.feedback import PidGains
     from slpi_ros.compensator.gains_file import TunedGains
     from slpi_ros.io.atomic_file import output_folder
@@ -65,11 +70,3 @@ def _run(options: Namespace) -> Result:
         {"gains": options.output, "axes": axes},
         command_line(*node, "--params-file", options.output, "-p", "feedback:=true"),
     )
-
-
-COMMAND = Command(
-    "gains and notches of the feedback from a model",
-    "slpi tune model.json -o gains.yaml --rate 2000",
-    _add_options,
-    _run,
-)

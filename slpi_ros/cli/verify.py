@@ -6,11 +6,15 @@ from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Command, Result, command_line
+from slpi_ros.cli.command import Result
 from slpi_ros.errors import UsageError
 
+HELP = "test a model on bags not used to identify it: passed, failed or unproved"
+EXAMPLE = "slpi verify check --model model.json --tolerance 0.05"
 
-def _add_options(command: ArgumentParser) -> None:
+
+def add_options(command: ArgumentParser) -> None:
+    """Add the options of the command."""
     from slpi_ros.io.desired import DESIRED, TRAJECTORY
     from slpi_ros.model.axis_model import START_MEMORIES
 
@@ -49,20 +53,14 @@ def _add_options(command: ArgumentParser) -> None:
     common.add_sensor(command)
 
 
-def _run(options: Namespace) -> Result:
+def run(options: Namespace) -> Result:
+    """Run the command."""
     from slpi_ros.io.atomic_file import output_folder
     from slpi_ros.io.schemas import format_document
     from slpi_ros.model.document import load_model
     from slpi_ros.reports import certificate as certificates
+    from slpi_ros.reports import verification as report
     from slpi_ros.reports.text import verdict
-    from slpi_ros.reports.verification import (
-        FILES,
-        describe_verification,
-        little_judged,
-        verification_good,
-        verification_limits,
-        write_files,
-    )
     from slpi_ros.verification.verify import UNPROVED
     from slpi_ros.workflows.verify import VerifyRequest, verify
 
@@ -74,7 +72,7 @@ def _run(options: Namespace) -> Result:
     model = common.with_sensor(load_model(options.model), options)
     if options.certificate and options.output is None:
         raise UsageError("--certificate: give the folder that it is written into, -o DIR")
-    names = (*FILES, *certificates.FILES) if options.certificate else FILES
+    names = (*report.FILES, *certificates.FILES) if options.certificate else report.FILES
     if options.output is not None:
         common.allow_folder(options, options.output, *names, inputs=[options.model])
     with nullcontext() if options.output is None else output_folder(options.output, *names) as folder:
@@ -84,31 +82,20 @@ def _run(options: Namespace) -> Result:
         done = verify(request)
         found = done.verification
         if folder:
-            write_files(folder, found)
+            report.write_files(folder, found)
         if folder and options.certificate:
-            of = certificates.Verified(found, done.records, options.bags, model, options.model)
-            certificates.write_files(folder, certificates.certificate(of))
+            certificates.write_files(folder, certificates.certificate(done, options.bags, model, options.model))
     if found.passed:
         next_command = f"slpi compensate {shlex.quote(options.model)} DESIRED.csv -o VOLTAGE.csv"
     elif found.verdict == UNPROVED and not any(done.independent):
         next_command = f"slpi verify OTHER_BAG --model {shlex.quote(options.model)}"
     else:
-        next_command = command_line(
-            "slpi", "diagnose", *options.bags, "--model", options.model, "-o", "diagnosis", *common.same_record(options)
-        )
+        next_command = common.diagnosis_of(options, options.model)
     return Result(
-        describe_verification(found, details=False),
+        report.describe_verification(found, details=False),
         format_document(found.to_document(), "verification"),
         next_command,
-        verdict(verification_limits(found), verification_good(found)) + little_judged(found),
-        describe_verification(found),
+        verdict(report.verification_limits(found), report.verification_good(found)) + report.little_judged(found),
+        report.describe_verification(found),
         found.passed,
     )
-
-
-COMMAND = Command(
-    "test a model on bags not used to identify it: passed, failed or unproved",
-    "slpi verify check --model model.json --tolerance 0.05",
-    _add_options,
-    _run,
-)

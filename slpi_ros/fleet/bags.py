@@ -6,8 +6,9 @@ import hashlib
 import json
 import time
 import warnings
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, replace
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from functools import cache
 from pathlib import Path
@@ -80,14 +81,9 @@ class Row:
     page: str = ""
     seconds: float = 0.0
 
-    def to_document(self) -> dict[str, Any]:
-        """Return the row as JSON values."""
-        document = asdict(self)
-        return document | {"causes": list(self.causes), "findings": list(self.findings)}
-
     @classmethod
     def of_document(cls, document: Mapping[str, Any]) -> "Row":
-        """Return the row of a document written by `to_document`."""
+        """Return the row of a line of the journal, written with `asdict`."""
         return cls(**{**document, "causes": tuple(document["causes"]), "findings": tuple(document["findings"])})
 
 
@@ -104,13 +100,9 @@ class Examined:
     refused: Mapping[str, str] = field(default_factory=dict)  # reasons by axis; "": the whole bag
     seconds: float = 0.0  # computing time
 
-    def to_document(self) -> dict[str, Any]:
-        """Return the examination as JSON values."""
-        return asdict(self)
-
     @classmethod
     def of_document(cls, document: Mapping[str, Any]) -> "Examined":
-        """Return the examination of a document written by `to_document`."""
+        """Return the examination of a line of the journal, written with `asdict`."""
         told = {axis: tuple(texts) for axis, texts in document["findings"].items()}
         read = {"bag": Bag(**document["bag"]), "axes": tuple(document["axes"]), "findings": told}
         return cls(**{**document, **read})
@@ -442,14 +434,8 @@ def _finite(value: float) -> float | None:
     return value if np.isfinite(value) else None
 
 
-class _quiet:
+@contextmanager
+def _quiet() -> Iterator[None]:
     """Suppress warnings, and use one thread of the numerical libraries, within a ``with`` block."""
-
-    def __enter__(self) -> None:
-        self._warnings, self._threads = warnings.catch_warnings(), threadpool_limits(1)
-        self._warnings.__enter__()
-        warnings.simplefilter("ignore")
-
-    def __exit__(self, *_: object) -> None:
-        self._warnings.__exit__(None, None, None)
-        self._threads.restore_original_limits()
+    with warnings.catch_warnings(action="ignore"), threadpool_limits(1):
+        yield

@@ -7,7 +7,7 @@ import warnings
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from importlib import import_module
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -99,7 +99,7 @@ def run(
         results = stack.enter_context(Results(output, options))
         for stage, model in sorted(given.items()):
             _keep_given(results, stage, model)
-        cluster = stack.enter_context(_connected(client, scheduler, workers, told or _silent))
+        cluster = stack.enter_context(_connected(client, scheduler, workers, told or (lambda _: None)))
         cluster.require_shared(results.folder, found[:1])
         work = _Fleet(results, cluster, Source((), topic, surroundings=surroundings), earliest, diagnose, finished)
         try:
@@ -119,26 +119,22 @@ def run(
         return as_table(results.state.rows()).to_pandas()
 
 
+@dataclass
 class _Fleet:
     """The steps of a run: examine all bags, choose references, compare the other bags, explain what is left."""
 
-    def __init__(
-        self,
-        results: Results,
-        cluster: "_Cluster",
-        reading: Source,
-        earliest: int | None,
-        diagnosed: bool,
-        finished: Callable[[Results], None] | None,
-    ) -> None:
-        self._results, self._cluster, self._reading = results, cluster, reading
-        self._earliest, self._diagnosed, self._finished = earliest, diagnosed, finished
-        self._next_table = time.monotonic() + WRITE
-        self._total = 0
+    results: Results
+    cluster: "_Cluster"
+    reading: Source
+    earliest: int | None
+    diagnosed: bool
+    finished: Callable[[Results], None] | None
+    _next_table: float = field(default_factory=lambda: time.monotonic() + WRITE)
+    _total: int = 0
 
     @property
     def _state(self) -> State:
-        return self._results.state
+        return self.results.state
 
     def process(self, found: Sequence[Bag]) -> bool:
         """Process the bags that are new or changed, and what an earlier run left; return whether there were any."""
@@ -153,7 +149,7 @@ class _Fleet:
         waiting = [one for one in known.values() if one.bag.path not in self._state.judged and self._wanted(one)]
         for one in waiting:
             if not one.axes:
-                self._results.add_judged(one.bag.path, Judged(tuple(one.rows())))
+                self.results.add_judged(one.bag.path, Judged(tuple(one.rows())))
         self._do(self._stage_tasks([one for one in waiting if one.axes]))
         self._do(self._explanation(path) for path, one in sorted(self._state.judged.items()) if one.unexplained)
         return True
@@ -161,31 +157,31 @@ class _Fleet:
     def write(self) -> None:
         """Write the table, and call `finished`."""
         self._write_table()
-        if self._finished:
-            self._finished(self._results)
+        if self.finished:
+            self.finished(self.results)
 
     def _write_table(self) -> None:
         began = time.monotonic()
-        self._results.write_table()
+        self.results.write_table()
         now = time.monotonic()
         self._next_table = now + max(WRITE, WRITE_PAUSE * (now - began))
 
     def _wanted(self, one: Examined) -> bool:
-        return self._earliest is None or one.date_ns is None or one.date_ns >= self._earliest
+        return self.earliest is None or one.date_ns is None or one.date_ns >= self.earliest
 
     def _do(self, tasks: Iterable[Task]) -> None:
-        for task, result in self._cluster.work(tasks):
-            self._cluster.extend(task.finish(result))
+        for task, result in self.cluster.work(tasks):
+            self.cluster.extend(task.finish(result))
             report_progress(f"{len(self._state.judged)} of {self._total} bags")
             if time.monotonic() > self._next_table:
                 self._write_table()
 
     def _examination(self, bag: Bag) -> Task:
         def finish(one: Examined) -> Iterable[Task]:
-            self._results.add_examined(one)
+            self.results.add_examined(one)
             return ()
 
-        return Task(Examined(bag, bag.stage), bags.examine, (bag, self._reading), finish)
+        return Task(Examined(bag, bag.stage), bags.examine, (bag, self.reading), finish)
 
     def _stage_tasks(self, waiting: Sequence[Examined]) -> Iterator[Task]:
         """Yield the first tasks of every stage: comparisons with its reference, or the identification of one."""
@@ -207,16 +203,16 @@ class _Fleet:
             return
 
         def finish(judged: Judged) -> Iterable[Task]:
-            self._results.add_judged(first.bag.path, judged, first.stage or None)
+            self.results.add_judged(first.bag.path, judged, first.stage or None)
             return self._next_of_stage(queue[1:])
 
         name = bags.model_name(first)
-        arguments = (first, self._reading, str(self._results.folder), name)
+        arguments = (first, self.reading, str(self.results.folder), name)
         yield Task(first, bags.identify_bag, arguments, finish)
 
     def _comparison(self, one: Examined) -> Task:
         reference = self._state.references[one.stage]
-        arguments = (one, self._reading, str(self._results.folder), reference, bags.model_name(one))
+        arguments = (one, self.reading, str(self.results.folder), reference, bags.model_name(one))
         return Task(one, bags.compare, arguments, lambda judged: self._keep(one, judged))
 
     def _explanation(self, path: str) -> Task:
@@ -224,13 +220,13 @@ class _Fleet:
         others = {stage: model for stage, model in sorted(self._state.references.items()) if stage != one.stage}
         reference = self._state.references.get(one.stage) if one.stage else None
         reference = reference or self._state.judged[path].model
-        known = (one, rows, self._reading, str(self._results.folder), reference, bags.model_name(one), others)
+        known = (one, rows, self.reading, str(self.results.folder), reference, bags.model_name(one), others)
         # It may take minutes.
-        arguments = (*known, self._diagnosed)
+        arguments = (*known, self.diagnosed)
         return Task(one, bags.explain, arguments, lambda judged: self._keep(one, judged), alone=True)
 
     def _keep(self, one: Examined, judged: Judged) -> Iterable[Task]:
-        self._results.add_judged(one.bag.path, judged)
+        self.results.add_judged(one.bag.path, judged)
         return ()
 
 
@@ -461,7 +457,3 @@ def _nanoseconds(since: str | None) -> int | None:
         return int(np.datetime64(since, "ns").astype(np.int64))
     except ValueError:
         raise UsageError(f"'{since}' is no date; give one such as 2026-01-31 or 2026-01-31T12:00") from None
-
-
-def _silent(_: str) -> None:
-    pass

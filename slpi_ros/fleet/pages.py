@@ -40,6 +40,7 @@ _PANELS = {
     "width": Quantity("change of loop width", "%", 100.0, ".3f"),
     "offset": Quantity("offset", "nm", 1e9, ".1f"),
 }
+_COLUMNS = "date", "verdict", "gain", "loop width", "offset (nm)", "error (nm)", "limit (nm)", "causes", "bag", "notes"
 _DAYS = Quantity("time since the first bag", "d", 1.0 / 86400.0, ".2f")
 
 
@@ -184,22 +185,7 @@ def _stage_page(name: str, axes: Sequence[StageSummary]) -> Page:
                 "Changes from the reference model; lines: two standard deviations.",
             )
         links = {_date(row.date_ns): f"../{row.page}" for row in one.rows if row.page}
-        page.table(
-            (
-                "date",
-                "verdict",
-                "gain",
-                "loop width",
-                "offset (nm)",
-                "error (nm)",
-                "limit (nm)",
-                "causes",
-                "bag",
-                "notes",
-            ),
-            [_cells(row) for row in one.rows],
-            links=links,
-        )
+        page.table(_COLUMNS, [_cells(row) for row in one.rows], links=links)
     return page
 
 

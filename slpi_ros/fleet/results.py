@@ -7,7 +7,7 @@ import json
 import os
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self
 
@@ -75,19 +75,12 @@ class Results:
 
     def add_examined(self, one: Examined) -> None:
         """Keep the examination of a bag; earlier rows of the bag no longer count."""
-        self._append({"examined": one.to_document()})
+        self._append({"examined": asdict(one)})
         self._take_examined(one)
 
     def add_judged(self, path: str, judged: Judged, reference_of: str | None = None) -> None:
         """Keep the rows of a bag; with `reference_of`, its model becomes the reference of this stage."""
-        document = {
-            "bag": path,
-            "rows": [row.to_document() for row in judged.rows],
-            "unexplained": judged.unexplained,
-            "model": judged.model,
-            "reference_of": reference_of,
-        }
-        self._append({"judged": document})
+        self._append({"judged": {"bag": path, **asdict(judged), "reference_of": reference_of}})
         self._take_judged(path, judged, reference_of)
 
     def add_reference(self, stage: str, model: str) -> None:

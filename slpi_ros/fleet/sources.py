@@ -3,20 +3,19 @@
 import csv
 import os
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from slpi_ros.errors import RecordError, UsageError
+from slpi_ros.io.bag_files import SUFFIXES, finished
 from slpi_ros.io.stage_name import stage_name
 from slpi_ros.io.unfinished_bags import abandoned_in, place_of
 from slpi_ros.model.document import load_model
 from slpi_ros.model.stage_model import StageModel
 
 _Path = str | os.PathLike[str]
-_SUFFIXES = (".mcap", ".db3", ".mcap.zstd", ".db3.zstd")
 _LIST_COLUMNS = ("bag", "stage")
-# The last bytes of a complete mcap file.
-_MCAP_END = b"\x89MCAP0\r\n"
 
 
 @dataclass(frozen=True)
@@ -50,18 +49,9 @@ def find_bags(sources: Sequence[_Path]) -> list[Bag]:
 
 def is_complete(bag: Bag, now: float, patience: float) -> bool:
     """Return whether a bag is completely written, or has not grown for `patience` (s) before `now` (s, Unix time)."""
-    # A folder is complete when it contains ``metadata.yaml``, a single mcap file when it ends as mcap files do.
-    path = Path(bag.path)
-    try:
-        if path.is_dir() and (path / "metadata.yaml").stat().st_size:
+    with suppress(OSError):
+        if finished(Path(bag.path)) is not None:
             return True
-        if path.suffix == ".mcap":
-            with path.open("rb") as file:
-                file.seek(-len(_MCAP_END), os.SEEK_END)
-                if file.read() == _MCAP_END:
-                    return True
-    except OSError:
-        pass
     return now - bag.modified * 1e-9 >= patience
 
 
@@ -87,7 +77,7 @@ def _bags_below(path: Path) -> Iterator[Path]:
         yield path
         return
     entries = sorted(entry for entry in path.iterdir() if not entry.name.startswith("."))
-    files = [entry for entry in entries if entry.is_file() and entry.name.endswith(_SUFFIXES)]
+    files = [entry for entry in entries if entry.is_file() and entry.name.endswith(SUFFIXES)]
     # A recorder names the files of a bag after its folder; other files in a folder are bags by themselves.
     if files and all(file.name.startswith(f"{path.name}_") for file in files):
         yield path

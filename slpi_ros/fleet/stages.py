@@ -57,17 +57,9 @@ class StageSummary:
     def to_document(self) -> dict[str, Any]:
         """Return the summary as in ``msg_schemas/fleet.schema.json``."""
         changes = [{"quantity": name, **asdict(change)} for name, found in self.changes.items() for change in found]
-        return {
-            "stage": self.stage,
-            "axis": self.axis,
-            "health": self.health,
-            "bags": self.bags,
-            "refused": self.refused,
-            "date_ns": self.date_ns,
-            "model": self.model,
-            "changes": changes,
-            "exchanges": [asdict(one) for one in self.exchanges],
-        }
+        names = "stage", "axis", "health", "bags", "refused", "date_ns", "model"
+        own = {name: getattr(self, name) for name in names}
+        return {**own, "changes": changes, "exchanges": [asdict(one) for one in self.exchanges]}
 
 
 def summarise(rows: Sequence[Row]) -> list[StageSummary]:

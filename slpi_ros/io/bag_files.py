@@ -8,7 +8,7 @@ import sqlite3
 import struct
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import BinaryIO
@@ -22,7 +22,6 @@ from slpi_ros.io.input_limits import (
     most_unpacked,
     open_input,
     read_input,
-    require_inputs,
 )
 from slpi_ros.io.unfinished_bags import abandoned_in, is_being_written, partial_path, place_of
 
@@ -146,7 +145,6 @@ def translated(source: Path) -> Iterator[None]:
 
 def require_bounded(file: Path) -> None:
     """Raise an error if a file of a bag is truncated, empty, or would unpack without an end."""
-    require_inputs([file], BAG_BYTES)
     with open_input(file, BAG_BYTES) as stream:
         header = stream.read(100)
         if header.startswith(_LFS):
@@ -249,11 +247,11 @@ class BagWatch:
         self.abandoned: tuple[Path, ...] = ()
         if not self.folder.is_dir():
             raise UsageError(f"{folder}: no such folder to watch for bags; make it, or name another")
-        self._seen = set(self._dated(_finished)[:-1])
+        self._seen = set(self._dated(finished)[:-1])
 
     def poll(self) -> list[Path]:
         """Return the bags completed since the last call, oldest first; none if the folder no longer exists."""
-        new = [bag for bag in self._dated(_finished) if bag not in self._seen]
+        new = [bag for bag in self._dated(finished) if bag not in self._seen]
         self._seen.update(new)
         last = time.time_ns() - int(self.patience * 1e9)
         self.abandoned = tuple(sorted(bag for bag, grown in self._dated(_grown) if grown <= last))
@@ -262,24 +260,16 @@ class BagWatch:
     def _dated(self, date: Callable[[Path], int | None]) -> list[tuple[Path, int]]:
         """Return the entries of the folder for which `date` returns a time (ns), oldest first, with this time."""
         found = []
-        for path in self._entries():
-            try:
-                when = date(path)
-            except OSError:
-                # The entry has been deleted in the meantime.
-                continue
-            if when is not None:
-                found.append((path, when))
+        # The folder, or an entry of it, may have been deleted in the meantime.
+        with suppress(OSError):
+            for path in self.folder.iterdir():
+                with suppress(OSError):
+                    if (when := date(path)) is not None:
+                        found.append((path, when))
         return sorted(found, key=lambda bag: bag[1])
 
-    def _entries(self) -> list[Path]:
-        try:
-            return list(self.folder.iterdir())
-        except OSError:
-            return []
 
-
-def _finished(path: Path) -> int | None:
+def finished(path: Path) -> int | None:
     """Return the time (ns) at which a bag was completed; None if `path` is no bag or is still being written."""
     if path.name.startswith("."):
         left = abandoned_in(path) if path.is_dir() else None
@@ -296,7 +286,7 @@ def _finished(path: Path) -> int | None:
 
 def _grown(path: Path) -> int | None:
     """Return the time (ns) at which an incomplete bag last grew; None if `path` is no bag or is complete."""
-    if _finished(path) is not None:
+    if finished(path) is not None:
         return None
     if not path.is_dir():
         return path.stat().st_mtime_ns if path.suffix == ".mcap" and not path.name.startswith(".") else None

@@ -9,7 +9,7 @@ counted from the end of the encapsulation header of four bytes.
 
 import struct
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,22 +38,10 @@ class CdrLayout:
     def decode(self, rows: ByteArray) -> NDArray[np.void] | None:
         """Return the fields of all messages (N, L), shape (N,), a view; None if one of them has another layout."""
         # Bytes after the end of the message are ignored, as some writers append undefined bytes.
-        if rows.shape[1] < self.template.size or not self._alike(rows):
+        size = self.template.size
+        if rows.shape[1] < size or not (rows[:, :size] == self.template)[:, self.fixed].all():
             return None
         return rows.view(self.dtype(rows.shape[1]))[:, 0]
-
-    def _alike(self, rows: ByteArray) -> bool:
-        """Return whether all messages have the fixed bytes of the template."""
-        # Adjacent fixed bytes are compared as integers of up to 8 bytes: several times faster than byte by byte.
-        ends = np.flatnonzero(np.diff(self.fixed, prepend=False, append=False)).tolist()
-        words = {
-            f"at {at}": (f"u{size}", at)
-            for begin, end in zip(ends[::2], ends[1::2], strict=True)
-            for at, size in _words(begin, end)
-        }
-        layout = CdrLayout(self.template, self.fixed, words)
-        template, others = (some.view(layout.dtype(some.shape[1]))[:, 0] for some in (self.template[None], rows))
-        return not any((others[word] != template[word]).any() for word in words)
 
     def dtype(self, length: int) -> np.dtype[np.void]:
         """Return the structured type of one message of `length` bytes."""
@@ -65,14 +53,6 @@ class CdrLayout:
                 "itemsize": length,
             }
         )
-
-
-def _words(begin: int, end: int) -> Iterator[tuple[int, int]]:
-    """Yield offset and size of words of 8, 4, 2 or 1 bytes that together cover the bytes from `begin` to `end`."""
-    while begin < end:
-        size = next(size for size in (8, 4, 2, 1) if size <= end - begin)
-        yield begin, size
-        begin += size
 
 
 class CdrReader:

@@ -231,15 +231,15 @@ class ColumnOptions:
     """The options of `slpi_ros.io.tables.import_table`, all with default values."""
 
     time: str | None = None
-    voltage: tuple[str, ...] = ()
-    displacement: tuple[str, ...] = ()
+    voltage: Sequence[str] = ()
+    displacement: Sequence[str] = ()
     displacement_unit: str | None = None
-    axes: tuple[str, ...] = ()
-    desired: tuple[str, ...] = ()
+    axes: Sequence[str] = ()
+    desired: Sequence[str] = ()
     sample_period: float | None = None  # s, instead of a column of time
     sensor_scale: float | None = None  # m for one unit of a column of displacement
     amplifier_gain: float | None = None  # V at the stage for one unit of a column of voltage
-    names: tuple[str, ...] = ()  # of the columns of a text without a header
+    names: Sequence[str] = ()  # of the columns of a text without a header
     sheet: str | None = None  # of a workbook
     group: str | None = None  # of a TDMS file
 

@@ -8,9 +8,7 @@ is checked before reading, and again while reading where a size is only declared
 import errno
 import os
 import stat
-from collections.abc import Iterable
 from io import BytesIO
-from pathlib import Path
 from typing import BinaryIO
 from zipfile import ZipFile
 
@@ -81,14 +79,6 @@ def read_input(path: str | os.PathLike[str], most: int) -> bytes:
     if len(content) > most:
         raise LimitError(_size(most))
     return content
-
-
-def require_inputs(paths: Iterable[Path], most: int) -> None:
-    """Raise LimitError unless all of these are folders, or regular files of at most `most` bytes, for other readers."""
-    for path in paths:
-        found = path.stat()
-        if not stat.S_ISDIR(found.st_mode):
-            _require(found, most)
 
 
 def require_count(count: int, most: int, what: str) -> None:

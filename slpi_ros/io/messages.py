@@ -3,7 +3,6 @@
 import struct
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -16,7 +15,6 @@ from slpi_ros.io.input_limits import MOST_AXES, LimitError, require_count
 JOINT_STATE, JOINT_TRAJECTORY = "sensor_msgs/msg/JointState", "trajectory_msgs/msg/JointTrajectory"
 FLOAT64 = "std_msgs/msg/Float64"
 SECOND_NS = 1_000_000_000
-_AT_ONCE = 65_536  # messages that are encoded at once
 # header stamps count seconds in int32
 _STAMP_END = 2**31 * SECOND_NS
 _XYZ = ("x", "y", "z")
@@ -69,16 +67,13 @@ MESSAGE_TYPES = {
     "std_msgs/msg/Float64MultiArray": MessageType(False, False, ("data",), _read_array),
     "geometry_msgs/msg/Vector3Stamped": MessageType(True, True, ("vector",), _fixed("vector", names=_XYZ)),
 }
+_MEASURED = {"Temperature": "temperature", "RelativeHumidity": "relative_humidity", "FluidPressure": "fluid_pressure"}
 # Types of quantities that are recorded beside a stage.
 QUANTITY_TYPES = {
     # A variance follows the value.
     **{
         f"sensor_msgs/msg/{name}": MessageType(True, False, (field,), _fixed(field, "variance"))
-        for name, field in (
-            ("Temperature", "temperature"),
-            ("RelativeHumidity", "relative_humidity"),
-            ("FluidPressure", "fluid_pressure"),
-        )
+        for name, field in _MEASURED.items()
     },
     FLOAT64: MESSAGE_TYPES[FLOAT64],
     "geometry_msgs/msg/WrenchStamped": MessageType(
@@ -133,18 +128,8 @@ def encode_joint_states(
             f"sample {int(unfit.argmax())}: time {stamp_ns[unfit][0] / SECOND_NS:g} s does not "
             "fit into a message stamp (0 to 2^31 s); shift the time axis"
         )
-    template = _joint_state(names, frame_id)
-    size, dtype = len(template), read_message(template, JOINT_STATE).layout.dtype(len(template))
-
-    def some(part: slice) -> Iterator[bytes]:
-        data = np.tile(np.frombuffer(template, np.uint8), stamp_ns[part].size)
-        fields = data.view(dtype)
-        fields["sec"], fields["nanosec"] = np.divmod(stamp_ns[part], SECOND_NS)
-        fields["position"], fields["effort"] = position[part], effort[part]
-        stream = data.tobytes()
-        return (stream[at : at + size] for at in range(0, len(stream), size))
-
-    return chain.from_iterable(some(slice(at, at + _AT_ONCE)) for at in range(0, stamp_ns.size, _AT_ONCE))
+    encoder = JointStateEncoder(names, frame_id)
+    return (encoder.encode(int(stamp), *numbers) for stamp, *numbers in zip(stamp_ns, position, effort, strict=True))
 
 
 def _joint_state(names: Sequence[str], frame_id: str) -> bytes:

@@ -4,6 +4,7 @@ import mmap
 import os
 import tempfile
 from collections.abc import Hashable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -32,15 +33,12 @@ _OWN: WeakSet[mmap.mmap] = WeakSet()
 def new_column(size: int, dtype: np.dtype[Any]) -> NDArray[Any]:
     """Return an uninitialised column of a record; a long one is mapped from a temporary file if there is room."""
     if size * dtype.itemsize >= MAPPED_FROM:
-        try:
-            with tempfile.TemporaryFile() as file:
-                # Reserved at once: a full disk must not be noticed later, at a write into the mapping.
-                os.posix_fallocate(file.fileno(), 0, size * dtype.itemsize)
-                pages = mmap.mmap(file.fileno(), size * dtype.itemsize)
-                _OWN.add(pages)
-                return np.ndarray(size, dtype, pages)
-        except OSError:
-            pass
+        with suppress(OSError), tempfile.TemporaryFile() as file:
+            # Reserved at once: a full disk must not be noticed later, at a write into the mapping.
+            os.posix_fallocate(file.fileno(), 0, size * dtype.itemsize)
+            pages = mmap.mmap(file.fileno(), size * dtype.itemsize)
+            _OWN.add(pages)
+            return np.ndarray(size, dtype, pages)
     return np.empty(size, dtype)
 
 

@@ -7,6 +7,7 @@ import re
 import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from itertools import islice
 from pathlib import Path
@@ -149,8 +150,7 @@ class TextTable(Table):
         exact: dict[str, Any] = {"float_precision": "round_trip"} if old and self._holds_long_numbers() else {}
         for mark in reversed(marks) if comma else marks:
             try:
-                with self._open() as file, warnings.catch_warnings():
-                    warnings.simplefilter("error", pd.errors.ParserWarning)
+                with self._open() as file, warnings.catch_warnings(action="error", category=pd.errors.ParserWarning):
                     parts = [
                         [part[place].to_numpy() for place in (*places, *beyond)]
                         for part in pd.read_csv(
@@ -265,19 +265,15 @@ def _seconds(cells: Any) -> FloatArray | None:
     import pandas as pd
 
     text = pd.Series(cells).str.strip().str.replace(",", ".").replace("", None)
-    try:
+    with suppress(ValueError, OverflowError):
         seconds = pd.to_timedelta(text).dt.total_seconds().to_numpy(np.float64)
         # After midnight they begin anew.
         return np.asarray(seconds + _DAY * np.cumsum(np.diff(seconds, prepend=seconds[0]) < -_HALF_A_DAY))
-    except (ValueError, OverflowError):
-        pass
     found = []
     for way in ({"format": "ISO8601"}, {"format": "mixed"}, {"format": "mixed", "dayfirst": True}):
-        try:
+        with suppress(ValueError, OverflowError):
             when = pd.to_datetime(text, utc=True, **way)
             found.append((when - when.iloc[0]).dt.total_seconds().to_numpy(np.float64))
-        except (ValueError, OverflowError):
-            continue
     # Whether day or month is first shows where a day ends: the record is the shorter one.
     return min(found, key=lambda seconds: float(np.nanmax(seconds) - np.nanmin(seconds)), default=None)
 

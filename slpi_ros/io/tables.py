@@ -3,6 +3,7 @@
 import csv
 import os
 from collections.abc import Iterable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from io import StringIO
 from pathlib import Path
@@ -52,18 +53,16 @@ def import_table(
     # without, units are seconds, volts and `displacement_unit`, by default micrometres. Columns named by a topic, such
     # as ``/room/temperature``, are recorded quantities; other ones are left out. Empty cells and ``nan`` become NaN. If
     # the first time is negative or no stamp of a message, all times are shifted such that the record begins at 0.
-    options = ColumnOptions(time, tuple(voltage), tuple(displacement), displacement_unit, tuple(axes))
+    options = ColumnOptions(time, voltage, displacement, displacement_unit, axes)
     return import_with_summary(path, options).record
 
 
 def load_table(path: Path, options: ColumnOptions | None = None) -> Table:
     """Find the columns of a table by the content of its file; DependencyError if its library is missing."""
     given = options or ColumnOptions()
-    try:
-        with open_input(path, TABLE_BYTES) as file:
-            begin = file.read(8)
-    except OSError:
-        begin = b""
+    begin = b""
+    with suppress(OSError), open_input(path, TABLE_BYTES) as file:
+        begin = file.read(8)
     suffix = path.suffix.lower()
     if begin.startswith(_OLD_WORKBOOK):
         raise RecordError(f"{path}: a workbook of an old Excel; save it as .xlsx or CSV")

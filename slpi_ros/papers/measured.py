@@ -66,8 +66,7 @@ def score(folder: Path, case: Case, kind: str) -> Scores:
 
 def _rms(model: AxisModel, record: Record, start: float, stop: float) -> float:
     driven = np.isfinite(record.voltage["x"])
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnidentifiedLoopWarning)
+    with warnings.catch_warnings(action="ignore", category=UnidentifiedLoopWarning):
         y = model.simulate(record.t[driven], record.voltage["x"][driven])
     error = y - record.displacement["x"][driven]
     t = record.t[driven]
@@ -76,19 +75,16 @@ def _rms(model: AxisModel, record: Record, start: float, stop: float) -> float:
 
 def exhibits(folder: Path | None) -> list[Exhibit]:
     """Return one exhibit for each measured record in `folder`; if there are none, an exhibit that states this."""
+
+    def none(ours: str, remark: str) -> list[Exhibit]:
+        return [Exhibit("Measured records", "The papers' own data are not public.", ours, remark)]
+
     if folder is None or not folder.is_dir():
-        return [
-            Exhibit(
-                "Measured records",
-                "The papers' own data are not public.",
-                f"No measured records: {folder or 'no folder given'}.",
-                "Give the folder of the records with --data.",
-            )
-        ]
+        return none(
+            f"No measured records: {folder or 'no folder given'}.", "Give the folder of the records with --data."
+        )
     found = [_exhibit(folder, case) for case in CASES if (folder / f"{case.name}.csv").is_file()]
-    names = ", ".join(f"{case.name}.csv" for case in CASES)
-    none = Exhibit("Measured records", "The papers' own data are not public.", f"{folder} holds none of {names}.", "-")
-    return found or [none]
+    return found or none(f"{folder} holds none of {', '.join(f'{case.name}.csv' for case in CASES)}.", "-")
 
 
 def _exhibit(folder: Path, case: Case) -> Exhibit:

@@ -1,6 +1,6 @@
 """Hysteresis curves and models of the MPI paper (Fig. 2 to 10, Tables 1 to 5), reproduced on a simulated axis."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import matplotlib
@@ -26,6 +26,7 @@ from slpi_ros.papers.mpi_study import (
     TABLE_4,
     TABLE_5,
     VARIABLE,
+    CycleFit,
     Drive,
     Study,
     VariablePath,
@@ -151,15 +152,8 @@ def exhibits(seed: int = 0) -> list[Exhibit]:
 
 def present(study: Study) -> list[Exhibit]:
     """Return the exhibits of a study with the paper's amplitudes and frequencies."""
-    return [
-        _amplitudes(study),
-        _frequencies(study),
-        _grid(study),
-        _peaks(study),
-        _fits(study),
-        _variable(study),
-        _scaled(study),
-    ]
+    parts = _amplitudes, _frequencies, _grid, _peaks, _fits, _variable, _scaled
+    return [part(study) for part in parts]
 
 
 def errors(metrics: ErrorMetrics) -> str:
@@ -169,6 +163,10 @@ def errors(metrics: ErrorMetrics) -> str:
 
 def _printed(table: Mapping[float, tuple[float, ...]]) -> dict[float, str]:
     return {amplitude: " / ".join(f"{value:.4f}" for value in row) for amplitude, row in table.items()}
+
+
+def _rounded(values: Mapping[float, float]) -> dict[float, str]:
+    return {amplitude: f"{value:.4f}" for amplitude, value in values.items()}
 
 
 def _table(key: str, unit: str, columns: Mapping[str, Mapping[float, str]]) -> Table:
@@ -191,7 +189,9 @@ def _amplitudes(study: Study) -> Exhibit:
     drives = {amplitude: drive for (amplitude, f), drive in study.drives.items() if f == lowest}
     width, rise, fall = ({a: 100.0 * drive.bows[k] for a, drive in drives.items()} for k in range(3))
     asymmetric = all(fall[a] > rise[a] for a in drives)
-    columns = {"mean width (%)": width, "rise off its chord (%)": rise, "fall off its chord (%)": fall}
+    strokes = {a: um(drive.settled_peak, 2) for a, drive in drives.items()}
+    shares = {"mean width (%)": width, "rise off its chord (%)": rise, "fall off its chord (%)": fall}
+    columns = {name: {a: f"{share:.1f}" for a, share in of.items()} for name, of in shares.items()}
     return Exhibit(
         title="Fig. 2: hysteresis at 0.1 Hz, 20 to 120 V",
         paper="Obvious hysteresis; at every amplitude rise and fall are not symmetric. No numbers are printed.",
@@ -199,14 +199,7 @@ def _amplitudes(study: Study) -> Exhibit:
         f"{_between(rise.values())} %; asymmetric at {'every amplitude' if asymmetric else 'some amplitudes only'}.",
         remark="Shown is the third cycle from rest. The stage was given a nearly straight rise and a bulging fall, "
         "as the paper describes them.",
-        tables=(
-            _table(
-                "amplitude",
-                "V",
-                {"stroke (µm)": {a: um(drive.settled_peak, 2) for a, drive in drives.items()}}
-                | {name: {a: f"{share:.1f}" for a, share in shares.items()} for name, shares in columns.items()},
-            ),
-        ),
+        tables=(_table("amplitude", "V", {"stroke (µm)": strokes} | columns),),
         pictures=(Picture(loops({"": {f"{a:g} V": drive for a, drive in drives.items()}}, 1), "Settled loops."),),
     )
 
@@ -216,6 +209,8 @@ def _frequencies(study: Study) -> Exhibit:
     drives = {a: {f: study.drives[a, f] for f in study.ringing} for a in ends}
     width = {a: np.array([100.0 * drive.bows[0] for drive in drives[a].values()]) for a in ends}
     everywhere = all(np.all(np.diff(widths) > 0.0) for widths in width.values())
+    told = {a: {f: f"{w:.2f}" for f, w in zip(drives[a], width[a], strict=True)} for a in ends}
+    groups = {f"{a} V": {f"{f:g} Hz": drive for f, drive in drives[a].items()} for a in ends}
     return Exhibit(
         title="Fig. 3: hysteresis at 20 V and at 120 V, 0.1 to 20 Hz",
         paper="The rise is highly linear at every frequency; the greater the frequency, the more obvious the "
@@ -223,22 +218,8 @@ def _frequencies(study: Study) -> Exhibit:
         ours=f"At {ends[1]} V the mean width of the loop goes from {width[ends[1]][0]:.1f} % of the stroke to "
         f"{width[ends[1]][-1]:.1f} %; it {'grows' if everywhere else 'does not always grow'} with the frequency.",
         remark="The width grows by the lag of the amplifier, which was chosen: the paper gives none.",
-        tables=(
-            _table(
-                "frequency",
-                "Hz",
-                {
-                    f"mean width at {a} V (%)": {f: f"{w:.2f}" for f, w in zip(drives[a], width[a], strict=True)}
-                    for a in ends
-                },
-            ),
-        ),
-        pictures=(
-            Picture(
-                loops({f"{a} V": {f"{f:g} Hz": drive for f, drive in drives[a].items()} for a in ends}, 2),
-                "Settled loops.",
-            ),
-        ),
+        tables=(_table("frequency", "Hz", {f"mean width at {a} V (%)": widths for a, widths in told.items()}),),
+        pictures=(Picture(loops(groups, 2), "Settled loops."),),
     )
 
 
@@ -266,6 +247,12 @@ def _peaks(study: Study) -> Exhibit:
     apart_b = max(abs(line.b - TABLE_1[amplitude][1]) for amplitude, line in lines.items())
     worst = max(abs(drive.first_peak / float(lines[a](f)) - 1.0) for (a, f), drive in study.drives.items())
     steps = np.diff([line.a * 1e6 for line in lines.values()])
+    columns = {
+        "a, paper (µm)": {amplitude: f"{TABLE_1[amplitude][0]:.3f}" for amplitude in lines},
+        "a, ours (µm)": {amplitude: um(line.a) for amplitude, line in lines.items()},
+        "b, paper": {amplitude: f"{TABLE_1[amplitude][1]:.3f}" for amplitude in lines},
+        "b, ours": {amplitude: f"{line.b:.4f}" for amplitude, line in lines.items()},
+    }
     return Exhibit(
         title="Fig. 5 and 6, Eq. 1 and Table 1: peak displacement over amplitude and frequency",
         paper="X_p = a f^b; a grows in equal steps with the amplitude, b is basically the same.",
@@ -275,18 +262,7 @@ def _peaks(study: Study) -> Exhibit:
         "its creep were set by Table 1. Linear creep gives one b for all amplitudes; the paper's goes from "
         f"{min(b for _, b in TABLE_1.values())} to {max(b for _, b in TABLE_1.values())}. Peaks are the largest "
         "readings of the first cycle from rest.",
-        tables=(
-            _table(
-                "amplitude",
-                "V",
-                {
-                    "a, paper (µm)": {amplitude: f"{TABLE_1[amplitude][0]:.3f}" for amplitude in lines},
-                    "a, ours (µm)": {amplitude: um(line.a) for amplitude, line in lines.items()},
-                    "b, paper": {amplitude: f"{TABLE_1[amplitude][1]:.3f}" for amplitude in lines},
-                    "b, ours": {amplitude: f"{line.b:.4f}" for amplitude, line in lines.items()},
-                },
-            ),
-        ),
+        tables=(_table("amplitude", "V", columns),),
         pictures=(Picture(peaks(study), "Peaks; lines: Eq. 1."),),
     )
 
@@ -299,6 +275,10 @@ def _fits(study: Study) -> Exhibit:
     lower = [a for a, fit in measured[MPI].items() if fit.fitted.r_squared < TABLE_3[a]]
     symmetric = [a for a, x, y in zip(measured[PI], mean[PI], mean[MPI], strict=True) if x < y]
     following = [fit.following.r_squared for fit in measured[MPI].values()]
+
+    def told(what: Callable[[CycleFit], str]) -> dict[str, dict[float, str]]:
+        return {name: {a: what(fit) for a, fit in measured[name].items()} for name in KINDS}
+
     return Exhibit(
         title="Fig. 7, Tables 2 and 3: the MPI model at 20 Hz",
         paper="R² of 0.9960 to 0.9997, on the very curves that the weights were fitted to. The “mean square error” of "
@@ -312,23 +292,9 @@ def _fits(study: Study) -> Exhibit:
         f"leaves {_between(mean[FAMILY] / mean[MPI], 2)} of MPI's mean error: it has many more parameters, and takes "
         "ringing that comes again in each cycle for the shape of the loop.",
         tables=(
-            _table(
-                ERRORS,
-                "V",
-                {"paper, MPI": _printed(TABLE_2)}
-                | {name: {a: errors(fit.fitted) for a, fit in measured[name].items()} for name in KINDS},
-            ),
-            _table(
-                "R²",
-                "V",
-                {"paper, MPI": {a: f"{r_squared:.4f}" for a, r_squared in TABLE_3.items()}}
-                | {name: {a: f"{fit.fitted.r_squared:.4f}" for a, fit in measured[name].items()} for name in KINDS},
-            ),
-            _table(
-                f"next cycle: {ERRORS}",
-                "V",
-                {name: {a: errors(fit.following) for a, fit in measured[name].items()} for name in KINDS},
-            ),
+            _table(ERRORS, "V", {"paper, MPI": _printed(TABLE_2)} | told(lambda fit: errors(fit.fitted))),
+            _table("R²", "V", {"paper, MPI": _rounded(TABLE_3)} | told(lambda fit: f"{fit.fitted.r_squared:.4f}")),
+            _table(f"next cycle: {ERRORS}", "V", told(lambda fit: errors(fit.following))),
         ),
         pictures=(
             Picture(fits(study.fastest, curves[MPI], MPI), "Settled cycles and the MPI model of each."),
@@ -373,6 +339,7 @@ def _variable(study: Study) -> Exhibit:
 
 def _scaled(study: Study) -> Exhibit:
     scaled = {amplitude: study.scaled[amplitude] for amplitude in TABLE_4}
+    curves = {a: fit.simulated for a, fit in scaled.items()}
     ratio = [fit.errors.mean / study.fits[MPI][a].fitted.mean for a, fit in scaled.items()]
     return Exhibit(
         title="Fig. 10, Tables 4 and 5: the SMPI model, scaled from 120 V",
@@ -389,16 +356,11 @@ def _scaled(study: Study) -> Exhibit:
                 {
                     "paper, SMPI": _printed(TABLE_4),
                     SMPI: {a: errors(fit.errors) for a, fit in scaled.items()},
-                    "R²: paper": {a: f"{r_squared:.4f}" for a, r_squared in TABLE_5.items()},
+                    "R²: paper": _rounded(TABLE_5),
                     f"R²: {SMPI}": {a: f"{fit.errors.r_squared:.4f}" for a, fit in scaled.items()},
                     f"R²: {FAMILY} of each": {a: f"{study.fits[FAMILY][a].fitted.r_squared:.4f}" for a in scaled},
                 },
             ),
         ),
-        pictures=(
-            Picture(
-                fits(study.fastest, {a: fit.simulated for a, fit in scaled.items()}, SMPI),
-                "Settled cycles and the SMPI model.",
-            ),
-        ),
+        pictures=(Picture(fits(study.fastest, curves, SMPI), "Settled cycles and the SMPI model."),),
     )

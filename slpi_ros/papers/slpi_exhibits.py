@@ -81,15 +81,8 @@ def separated(separation: Separation) -> Figure:
         panel.plot(v[loop.path], y[loop.path], ".-", color=DESIRED, markersize=3, linewidth=0.8)
         panel.plot(v[loop.vertex], y[loop.vertex], "^", color=COLOURS[0], markersize=9, label="vertex")
         if loop.joined.size:
-            panel.plot(
-                v[loop.joined],
-                y[loop.joined],
-                "o",
-                color=COLOURS[2],
-                markersize=9,
-                fillstyle="none",
-                label="joined here",
-            )
+            ring = {"color": COLOURS[2], "markersize": 9, "fillstyle": "none"}
+            panel.plot(v[loop.joined], y[loop.joined], "o", label="joined here", **ring)
         panel.set_title(f"level {ROMAN[loop.level]}", fontsize=11)
         panel.legend(frameon=False, loc="upper left")
         label_axes(panel, V, UM if panel is drawn[0] else "")
@@ -180,16 +173,9 @@ def draw_compensation(study: Study, names: tuple[str, ...]) -> Figure:
 
 def exhibits(random: Study) -> list[Exhibit]:
     """Return the exhibits of the SLPI paper, from the given study of its random path and from further experiments."""
+    parts = _nonlinear_curve, _inclinations, _separation, _single_models, _closure, _classical, _inverse
     return [
-        _nonlinear_curve(random),
-        _inclinations(random),
-        _separation(random),
-        _single_models(random),
-        _closure(random),
-        _classical(random),
-        _inverse(random),
-        compensation(random),
-        straight_line(random),
+        *(part(random) for part in (*parts, compensation, straight_line)),
         other("Fig. 16 and 17: double inner loop, one vertex on the back branch", study(DOUBLE_INNER_LOOP)),
         other("Fig. 18 and 19: overlapped inner and outer loop", study(OVERLAPPED)),
         unseen(unseen_paths(random)),

@@ -227,15 +227,13 @@ def reached(v: FloatArray) -> FloatArray:
 
 def forward(drive: Drive, v: FloatArray) -> FloatArray:
     """Return the model's displacement, shape (N,), metres, for voltages (V), without warnings of unidentified loops."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnidentifiedLoopWarning)
+    with warnings.catch_warnings(action="ignore", category=UnidentifiedLoopWarning):
         return drive.forward_array(v)
 
 
 def voltage_for(drive: Drive, y: FloatArray) -> FloatArray:
     """Return the model's voltage, shape (N,), volts, within the identified range, for displacements `y` (m)."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", UnidentifiedLoopWarning)
+    with warnings.catch_warnings(action="ignore", category=UnidentifiedLoopWarning):
         return drive.inverse_array(y, *VOLTAGE_RANGE)
 
 

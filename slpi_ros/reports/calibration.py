@@ -9,7 +9,7 @@ from slpi_ros.errors import length
 from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.model.document import save_model
 from slpi_ros.reports import diagnosis as diagnosis_files
-from slpi_ros.reports.chart import AFTER, BEFORE, DESIRED, DISPLACEMENT, TIME, Chart, Panel, Quantity, thin_line
+from slpi_ros.reports.chart import AFTER, BEFORE, DESIRED, Chart, Quantity, over_time
 from slpi_ros.reports.page import Page
 from slpi_ros.reports.text import describe_model
 from slpi_ros.reports.tuning import describe, describe_measured
@@ -105,10 +105,8 @@ def _errors(outcome: Outcome) -> list[list[str]]:
 def _chart(outcome: Outcome, axis: str) -> Chart:
     verified = [step.errors[axis] for step in outcome.steps if step.errors]
     first, last = verified[0], verified[-1]
-    chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, TRACKING_ERROR, 1.2)], "column", 540)
-    kept = thin_line(last.desired)
-    chart.line(0, "desired", last.t[kept], last.desired[kept], DESIRED)
+    chart = over_time(TRACKING_ERROR)
+    chart.thinned(0, "desired", last.t, last.desired, DESIRED)
     for name, one, colour in (("first", first, BEFORE), ("last", last, AFTER)):
-        kept = thin_line(one.error)
-        chart.line(1, f"{name} path", one.t[kept], one.error[kept], colour, width=1.0)
+        chart.thinned(1, f"{name} path", one.t, one.error, colour, width=1.0)
     return chart

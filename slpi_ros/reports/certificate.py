@@ -2,7 +2,6 @@
 
 import platform
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -21,10 +20,12 @@ from slpi_ros.model.uncertainty import COMPONENTS, COVERAGE_FACTOR, AxisUncertai
 from slpi_ros.reports.page import Page
 from slpi_ros.reports.uncertainty import PLACES, TIMES, uncertainty_document
 from slpi_ros.reports.verification import SEVERITY, record_notes
-from slpi_ros.verification.verify import RecordVerification, Verification, counted
+from slpi_ros.verification.verify import RecordVerification, counted
+from slpi_ros.workflows.verify import VerifyOutcome
 
 SCHEMA = "slpi_ros/certificate/1"
 FILES = "certificate.json", "certificate.html"
+AXIS_FIGURES = "rms_m", "maximum_m", "rest_rms_m", "rest_maximum_m", "samples"
 PROGRAMS = "slpi_ros", "numpy", "scipy"
 METHOD = (
     "The voltage of each record is given to the model, and the displacement that it computes (free run, without any "
@@ -35,48 +36,36 @@ METHOD = (
 )
 
 
-@dataclass(frozen=True)
-class Verified:
-    """What a certificate rests on: the verification, its records and their bags, and the model and its file."""
+def certificate(done: VerifyOutcome, bags: Sequence[str], model: StageModel, model_file: str) -> dict[str, Any]:
+    """Return the certificate as a document, ``msg_schemas/certificate.schema.json``; RecordError if a file is gone.
 
-    verification: Verification
-    records: Sequence[Record]
-    bags: Sequence[str]
-    model: StageModel
-    model_file: str
-
-
-def certificate(of: Verified) -> dict[str, Any]:
-    """Return the certificate as a document, ``msg_schemas/certificate.schema.json``; RecordError if a file is gone."""
-    found = of.verification
-    ((_, digest),) = digests(of.model_file).items()
-    known = _middles(of.records, of.model)
+    It rests on a verification with its records and their bags, and on a model and its file.
+    """
+    found = done.verification
+    ((_, digest),) = digests(model_file).items()
+    known = _middles(done.records, model)
     return {
         "schema": SCHEMA,
-        "hardware_id": found.hardware_id or next((each.hardware_id for each in of.records if each.hardware_id), ""),
+        "hardware_id": found.hardware_id or next((each.hardware_id for each in done.records if each.hardware_id), ""),
         "issued": datetime.now(UTC).isoformat(timespec="seconds"),
         "verdict": found.verdict,
         "tolerance_m": found.tolerance,
         "method": list(METHOD),
-        "model": {"source": of.model_file, "sha256": digest, "created": of.model.created},
+        "model": {"source": model_file, "sha256": digest, "created": model.created},
         "records": [
-            _record(record, bag, of.model, independent=one.independent)
-            for record, bag, one in zip(of.records, of.bags, next(iter(found.axes.values())).records, strict=True)
+            _record(record, bag, model, independent=one.independent)
+            for record, bag, one in zip(done.records, bags, next(iter(found.axes.values())).records, strict=True)
         ],
         "axes": {
             name: {
                 "verdict": axis.verdict,
-                **_model(of.model.axes[name]),
-                "rms_m": axis.overall.rms,
-                "maximum_m": axis.overall.maximum,
-                "rest_rms_m": axis.rest.rms,
-                "rest_maximum_m": axis.rest.maximum,
-                "samples": axis.overall.samples,
+                **_model(model.axes[name]),
+                **{figure: axis.to_document()[figure] for figure in AXIS_FIGURES},
                 "errors": [
-                    _errors(one, of.model.surrounded(record).axes[name], _age(of.model, record))
-                    for one, record in zip(axis.records, of.records, strict=True)
+                    _errors(one, model.surrounded(record).axes[name], _age(model, record))
+                    for one, record in zip(axis.records, done.records, strict=True)
                 ],
-                **_uncertainty(of.model.axes[name], known),
+                **_uncertainty(model.axes[name], known),
             }
             for name, axis in found.axes.items()
         },

@@ -56,18 +56,18 @@ def thin_line(*signals: FloatArray, most: int = LINE_POINTS) -> IntArray:
         padded[:size] = signal
         rows = padded.reshape(stretches, length)
         offset = np.arange(stretches) * length
-        kept.append(_holes(signal, length))
+        first, after = sequences(np.isnan(signal))
+        kept.append(first[after - first >= length])
         kept += [offset + np.argmin(np.where(np.isnan(rows), np.inf, rows), axis=1)]
         kept += [offset + np.argmax(np.where(np.isnan(rows), -np.inf, rows), axis=1)]
     found = np.unique(np.concatenate(kept))
     return found[found < size]
 
 
-def _holes(signal: FloatArray, length: int) -> IntArray:
-    """Return the first sample of each sequence of at least `length` NaN in a signal, shape (N,)."""
-    missing = np.pad(np.isnan(signal), 1).astype(np.int8)
-    first, after = np.flatnonzero(np.diff(missing) > 0), np.flatnonzero(np.diff(missing) < 0)
-    return first[after - first >= length]
+def sequences(chosen: Mask) -> tuple[IntArray, IntArray]:
+    """Return the first sample of each sequence of `chosen` samples, shape (N,), and the sample after it."""
+    steps = np.diff(np.pad(chosen, 1).astype(np.int8))
+    return np.flatnonzero(steps > 0), np.flatnonzero(steps < 0)
 
 
 def thin_cloud(x: FloatArray, y: FloatArray, most: int = CLOUD_POINTS) -> IntArray:
@@ -138,6 +138,11 @@ class Chart:
         if _alone(y).any():
             style |= {"mode": "lines+markers", "marker": {"color": colour, "size": width}}
         self._add(panel, name, x, y, {"type": "scatter", **style})
+
+    def thinned(self, panel: int, name: str, x: FloatArray, y: FloatArray, colour: str, *, width: float = 1.4) -> None:
+        """Add a line as `line` does, through about `LINE_POINTS` of the points."""
+        kept = thin_line(y)
+        self.line(panel, name, x[kept], y[kept], colour, width=width)
 
     def dots(self, panel: int, name: str, x: FloatArray, y: FloatArray, colour: str, *, faint: bool = False) -> None:
         """Add points, shape (N,) each, SI; `faint` points belong to a line of the same name, which is added later."""
@@ -282,6 +287,11 @@ class Chart:
             if panel < len(self.panels) - 1 and here.x == self.panels[panel + 1].x:
                 across.update(title={"text": ""})
         return {f"xaxis{number}": across, f"yaxis{number}": up}
+
+
+def over_time(error: Quantity) -> Chart:
+    """Return an empty chart of the displacement over time, and of an error below."""
+    return Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, error, 1.2)], "column", 540)
 
 
 def _alone(y: FloatArray) -> Mask:

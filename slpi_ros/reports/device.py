@@ -21,19 +21,11 @@ SENSOR_SCALES = {"labjack": 1e-5, "nidaqmx": 1e-5}
 def check_device(name: str, found: Found, channels: Sequence[str], positions: FloatArray) -> list[Check]:
     """Return the checks of an open device, its channels one by one; `positions` (m, (N, channels)) were read of it."""
     checks = [Check(OK, f"{name}: {found.identity}; nothing was written")]
-    rows = zip(
-        channels,
-        found.setpoints,
-        found.reading.voltages,
-        found.reading.positions,
-        found.lowest,
-        found.highest,
-        found.servo,
-        strict=True,
-    )
-    for channel, setpoint, v, x, low, high, servo in rows:
+    for place, channel in enumerate(channels):
+        v, x = found.reading.voltages[place], found.reading.positions[place]
+        low, high, setpoint = found.lowest[place], found.highest[place], found.setpoints[place]
         told = f"{name}, channel {channel}"
-        if servo:
+        if found.servo[place]:
             checks.append(
                 Check(FAILED, f"{told}: the servo is on: the device moves the voltage itself; switch it off, or set "
                               "take_over_servo")
@@ -46,7 +38,6 @@ def check_device(name: str, found: Found, channels: Sequence[str], positions: Fl
             )
         if not math.isfinite(x):
             checks.append(Check(NOTE, f"{told}: no position: no calibration is possible with this device alone"))
-        place = channels.index(channel)
         travel = implausible_stroke(found.travel[place]) if found.travel else ""
         if unit := travel or implausible_noise(positions[:, place]):
             checks.append(
@@ -54,12 +45,8 @@ def check_device(name: str, found: Found, channels: Sequence[str], positions: Fl
                               "sensor_scale")
             )  # fmt: skip
         if abs(setpoint - v) > 1e-3 * max(abs(v), 1.0):
-            checks.append(
-                Check(
-                    NOTE,
-                    f"{told}: its setpoint is {setpoint:.6g} V, it reports {v:.6g} V: the first step may be as large",
-                )
-            )
+            text = f"its setpoint is {setpoint:.6g} V, it reports {v:.6g} V: the first step may be as large"
+            checks.append(Check(NOTE, f"{told}: {text}"))
     return checks + [Check(NOTE, f"{name}: {note}") for note in found.notes]
 
 

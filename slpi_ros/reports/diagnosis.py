@@ -5,18 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from slpi_ros.diagnosis import result
 from slpi_ros.diagnosis.fingerprint import Left
-from slpi_ros.diagnosis.result import (
-    AMBIGUOUS,
-    NAMED,
-    NOTHING_FOUND,
-    PARTLY_NAMED,
-    UNEXPLAINED,
-    AxisDiagnosis,
-    Diagnosis,
-    NamedEffect,
-    Traces,
-)
+from slpi_ros.diagnosis.result import AxisDiagnosis, Diagnosis, NamedEffect, Traces
 from slpi_ros.effects.registry import to_document
 from slpi_ros.errors import SlpiError, length
 from slpi_ros.io.atomic_file import all_or_nothing, make_folder
@@ -74,9 +65,9 @@ def page_of(diagnosis: Diagnosis) -> Page:
 
 
 def _severity(found: AxisDiagnosis) -> Severity:
-    if found.verdict in (NOTHING_FOUND, NAMED):
+    if found.verdict in (result.NOTHING_FOUND, result.NAMED):
         return "good"
-    return "warn" if found.verdict in (PARTLY_NAMED, AMBIGUOUS) else "bad"
+    return "warn" if found.verdict in (result.PARTLY_NAMED, result.AMBIGUOUS) else "bad"
 
 
 def _figures(found: AxisDiagnosis) -> dict[str, str]:
@@ -253,7 +244,7 @@ def _show_charts(page: Page, name: str, found: AxisDiagnosis) -> None:
     left = [Series(model.name, y - model.values, model.colour) for model in models]
     parts = _parts(traces)
     drawings = {
-        "time": views.over_time(t, y, models, found.noise_rms, parts),
+        "time": views.model_over_time(t, y, models, found.noise_rms, parts),
         "motion": views.over_motion(v, left, parts, motion),
         "frequency": views.over_frequency(t, left, parts, motion, found.noise_rms),
     }
@@ -300,7 +291,7 @@ def diagnosis_limits(diagnosis: Diagnosis) -> dict[str, str]:
         causes = [
             f"{' or '.join((named.name, *named.alternatives))} ({named.gain_percent:.0f} %)" for named in found.effects
         ]
-        if found.verdict == UNEXPLAINED:
+        if found.verdict == result.UNEXPLAINED:
             causes.append("a cause that is none of the known effects")
         if not causes and above_noise(found.given_rms, found.noise_rms, high - low):
             causes.append("a model that does not fit the stage as it is now")

@@ -175,21 +175,14 @@ def _of_times(graph: Graph) -> Iterator[Check]:
         return
     jitter = float(np.percentile(np.abs(steps - period), 95)) / period
     text = f"{topic}: {1.0 / period:.4g} states per second, jitter {jitter:.0%} of the period"
-    if jitter > JITTER:
-        yield Check(FAILED, f"{text}; stamp each state with the time of its measurement")
-    else:
-        yield Check(OK, text)
+    yield _checked(jitter <= JITTER, text, "stamp each state with the time of its measurement")
     longest = float(np.max(steps))
     if longest > GAP * period:
         yield Check(FAILED, f"{topic}: a gap of {longest:.3g} s; relieve the processor or the network")
     offset = float(np.median(arrivals - stamps))
     text = f"{topic}: the stamps are {abs(offset):.3g} s {'old' if offset >= 0.0 else 'ahead'} when they come"
-    if -NEWEST <= offset <= OLDEST:
-        yield Check(OK, text)
-    else:
-        yield Check(
-            FAILED, f"{text}; synchronise the clocks (chrony, PTP), or use use_sim_time in all nodes or in none"
-        )
+    remedy = "synchronise the clocks (chrony, PTP), or use use_sim_time in all nodes or in none"
+    yield _checked(-NEWEST <= offset <= OLDEST, text, remedy)
 
 
 def _of_values(graph: Graph) -> Iterator[Check]:
@@ -230,15 +223,12 @@ def _units(graph: Graph, axis: str) -> str:
 
 def _of_commands(graph: Graph) -> Iterator[Check]:
     topic, publishers = graph.command_topic, graph.command_publishers
-    if len(publishers) > 1:
-        text = f"{len(publishers)} publishers: {', '.join(publishers)}; stop all but one, as the voltage would jump"
-        yield Check(FAILED, f"{topic}: {text}")
-    else:
-        yield Check(OK, f"{topic}: published by {', '.join(publishers) or 'nobody'}")
-    if graph.command_subscribers:
-        yield Check(OK, f"{topic}: received by {', '.join(graph.command_subscribers)}")
-    else:
-        yield Check(FAILED, f"{topic}: no subscriber; start the driver of the amplifier, or remap its topic")
+    told = f"{len(publishers)} publishers: " if len(publishers) > 1 else "published by "
+    told += ", ".join(publishers) or "nobody"
+    yield _checked(len(publishers) <= 1, f"{topic}: {told}", "stop all but one, as the voltage would jump")
+    told = f"received by {', '.join(graph.command_subscribers)}" if graph.command_subscribers else "no subscriber"
+    remedy = "start the driver of the amplifier, or remap its topic"
+    yield _checked(bool(graph.command_subscribers), f"{topic}: {told}", remedy)
 
 
 def _of_one_stage(hardware_id: str, axes: Sequence[str], model: StageModel) -> Iterator[Check]:
@@ -267,14 +257,17 @@ def _of_range(graph: Graph, model: StageModel) -> Iterator[Check]:
             )
 
 
+def _checked(good: bool, text: str, remedy: str) -> Check:
+    return Check(OK, text) if good else Check(FAILED, f"{text}; {remedy}")
+
+
 def _within(axis: str, what: str, reached: Range, allowed: Range, whose: str, remedy: str) -> Check:
     slack = TOLERATED_SHARE * (allowed[1] - allowed[0])
     where = f"{reached[0]:.4g} V" if reached[0] == reached[1] else f"{reached[0]:.4g} to {reached[1]:.4g} V"
     text = f"axis {axis}: {what} {'at' if reached[0] == reached[1] else 'from'} {where}"
     bounds = f"{allowed[0]:.4g} to {allowed[1]:.4g} V of {whose}"
-    if allowed[0] - slack <= reached[0] and reached[1] <= allowed[1] + slack:
-        return Check(OK, f"{text}, within {bounds}")
-    return Check(FAILED, f"{text}, outside {bounds}; {remedy}")
+    inside = allowed[0] - slack <= reached[0] and reached[1] <= allowed[1] + slack
+    return _checked(inside, f"{text}, {'within' if inside else 'outside'} {bounds}", remedy)
 
 
 def _overlap(what: str, known: Range, limits: Range, remedy: str) -> Check:

@@ -9,7 +9,7 @@ import numpy as np
 from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import length
 from slpi_ros.learning.axis_learner import AxisLearner
-from slpi_ros.reports.chart import AFTER, BEFORE, DESIRED, DISPLACEMENT, NOISE, TIME, Chart, Panel, Quantity, thin_line
+from slpi_ros.reports.chart import AFTER, BEFORE, DESIRED, DISPLACEMENT, NOISE, TIME, Chart, Panel, Quantity
 from slpi_ros.reports.page import Page
 from slpi_ros.workflows.learn import LearnedPass, LearnOutcome
 
@@ -83,13 +83,10 @@ def _over_passes(axis: AxisLearner) -> Chart:
 def _over_path(outcome: LearnOutcome, axis: AxisLearner, own: Sequence[LearnedPass], name: str) -> Chart:
     t = outcome.learner.t - outcome.learner.t[0]
     chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, CORRECTION), Panel(TIME, DEVIATION, 1.2)], "column", 680)
-    kept = thin_line(axis.desired)
-    chart.line(0, "desired", t[kept], axis.desired[kept], DESIRED)
-    kept = thin_line(axis.correction)
-    chart.line(1, "next pass", t[kept], axis.correction[kept], AFTER)
+    chart.thinned(0, "desired", t, axis.desired, DESIRED)
+    chart.thinned(1, "next pass", t, axis.correction, AFTER)
     for label, one, colour in (("first", own[0], BEFORE), ("last", own[-1], AFTER)):
-        kept = thin_line(one.errors[name])
-        chart.line(2, f"{label} pass here", t[kept], one.errors[name][kept], colour, width=1.0)
+        chart.thinned(2, f"{label} pass here", t, one.errors[name], colour, width=1.0)
     return chart
 
 
@@ -99,8 +96,7 @@ def _spectrum(axis: AxisLearner, own: Sequence[LearnedPass], name: str) -> Chart
     frequency = np.asarray(np.fft.rfftfreq(size, axis.dt)[1:], dtype=np.float64)
     for label, one, colour in (("first", own[0], BEFORE), ("last", own[-1], AFTER)):
         amplitude = np.maximum(_amplitudes(one.errors[name]), LEAST)
-        kept = thin_line(amplitude)
-        chart.line(0, f"{label} pass here", frequency[kept], amplitude[kept], colour)
+        chart.thinned(0, f"{label} pass here", frequency, amplitude, colour)
     return chart
 
 

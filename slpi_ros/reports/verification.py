@@ -10,41 +10,19 @@ from slpi_ros.io.atomic_file import all_or_nothing, make_folder
 from slpi_ros.io.schemas import format_document
 from slpi_ros.model.axis_model import ABOVE_NOISE
 from slpi_ros.reports import views
-from slpi_ros.reports.chart import (
-    AFTER,
-    BEFORE,
-    DESIRED,
-    DISPLACEMENT,
-    MEASURED,
-    NOISE,
-    TIME,
-    Chart,
-    Panel,
-    Quantity,
-    thin_line,
-)
+from slpi_ros.reports.chart import AFTER, BEFORE, DESIRED, MEASURED, NOISE, Chart, Panel, Quantity, over_time, thin_line
 from slpi_ros.reports.chart import CAUSES as COLOURS
 from slpi_ros.reports.page import Page, Severity
+from slpi_ros.verification import verify
 from slpi_ros.verification.step_answers import StepAnswer
 from slpi_ros.verification.tracking import CAUSES, Burst, ErrorPart, Tracking
-from slpi_ros.verification.verify import (
-    FAILED,
-    FEW,
-    LEAST,
-    MOST_KNOWN,
-    PASSED,
-    TIMES_REPEATABILITY,
-    UNPROVED,
-    AxisVerification,
-    RecordVerification,
-    Verification,
-)
+from slpi_ros.verification.verify import AxisVerification, RecordVerification, Verification
 
 FILES = "verification.json", "report.html"
 TRACKING_ERROR = Quantity("measured - desired", "nm", 1e9, ".1f")
 STEP_SIZE, SETTLING = Quantity("step", "µm", 1e6, ".4g"), Quantity("settling time", "ms", 1e3, ".4g")
 COLOUR = {**dict(zip(CAUSES, (*COLOURS, AFTER), strict=False)), "model": BEFORE, "noise": NOISE}
-SEVERITY: dict[str, Severity] = {PASSED: "good", UNPROVED: "warn", FAILED: "bad"}
+SEVERITY: dict[str, Severity] = {verify.PASSED: "good", verify.UNPROVED: "warn", verify.FAILED: "bad"}
 # Names of the parts of a tracking error; smaller ones than this share of the rms without the zero are
 # not told.
 PARTS = {
@@ -95,7 +73,7 @@ def verification_limits(found: Verification) -> dict[str, str]:
         tracked = [record.tracking for record in axis.records if record.tracking]
         said = []
         if not axis.passed:
-            worst, unproved = axis.worst, axis.verdict == UNPROVED
+            worst, unproved = axis.worst, axis.verdict == verify.UNPROVED
             limit = _limiting(worst)
             if unproved:
                 limit = f"unproved{_where_unproved(axis.unproved)}"
@@ -147,7 +125,7 @@ def verification_good(found: Verification) -> str:
 def little_judged(found: Verification) -> str:
     """Return what share of the record with the least judged samples is judged, and why; "" if most are on each."""
     least = min((record for axis in found.axes.values() for record in axis.records), key=lambda record: record.share)
-    return "" if least.share >= MOST_KNOWN else f"; {least.error.name}: {_judged_share(least)}"
+    return "" if least.share >= verify.MOST_KNOWN else f"; {least.error.name}: {_judged_share(least)}"
 
 
 def describe_verification(found: Verification, *, details: bool = True) -> list[str]:
@@ -177,7 +155,7 @@ def _summary(axis: AxisVerification) -> str:
     if axis.passed:
         moved = [record for record in axis.records if record.zero_moved]
         return said + (f" The zero has moved by {_um(moved[0].offset)} µm; the loops are the same." if moved else "")
-    if axis.verdict == UNPROVED:
+    if axis.verdict == verify.UNPROVED:
         return f"{said} {_why_unproved(axis.unproved)}"
     limit = _limiting(axis.worst)
     if limit == FOREIGN:
@@ -202,13 +180,13 @@ def _lacking(record: RecordVerification) -> str:
 
 def _why_unproved(record: RecordVerification) -> str:
     """Return why nothing is proved (useless readings, the initial state, a record of the fit), and what to do."""
-    if record.unusable >= 1.0 - LEAST:
+    if record.unusable >= 1.0 - verify.LEAST:
         return "Too few readings are left: check the sensor and its link, 'slpi doctor' says what is wrong with them."
-    if record.share >= LEAST and record.judged_error <= record.limit and not record.independent:
+    if record.share >= verify.LEAST and record.judged_error <= record.limit and not record.independent:
         return "The model was identified from this record, so that a small error proves nothing: record another one."
-    if record.share >= LEAST and record.judged_error <= record.limit and record.lacking:
+    if record.share >= verify.LEAST and record.judged_error <= record.limit and record.lacking:
         return "Without what the model follows a small error proves nothing."
-    if record.share >= LEAST:
+    if record.share >= verify.LEAST:
         return (
             f"The initial state is unknown, which alone can be {length(record.offset_uncertainty)}: begin a record "
             "at an end of the voltage range, say the initial state with --start-memory, or judge --without-offset."
@@ -229,7 +207,7 @@ def _error(record: RecordVerification) -> str:
 def _judged_share(record: RecordVerification) -> str:
     """Return how many samples are judged, and why not more."""
     said = f"{record.error.samples:,} of {record.samples:,} samples judged ({record.share:.0%})"
-    if record.share >= MOST_KNOWN:
+    if record.share >= verify.MOST_KNOWN:
         return said
     if record.unusable > (1.0 - record.share) / 2:
         why = f", as {record.unusable:.0%} of the readings are missing, stuck, late or outliers"
@@ -237,7 +215,7 @@ def _judged_share(record: RecordVerification) -> str:
         why = f", as the initial state is unknown before {record.known_from:.4g} s"
     else:
         why = ""
-    return f"{'WARNING: only ' if record.share < FEW else ''}{said}{why}"
+    return f"{'WARNING: only ' if record.share < verify.FEW else ''}{said}{why}"
 
 
 def record_notes(record: RecordVerification) -> list[str]:
@@ -355,8 +333,8 @@ def _records_table(axis: AxisVerification) -> tuple[Sequence[str], list[Sequence
     ]
     held_to = "rms" if axis.worst.absolute else "rms without offset"
     caption = (
-        f"Measured - model, free-run. The limit holds for the {held_to}: the tolerance, else {TIMES_REPEATABILITY:g} "
-        "times the repeatability, but at least 0.02 % of the stroke. Repeatability: "
+        f"Measured - model, free-run. The limit holds for the {held_to}: the tolerance, else "
+        f"{verify.TIMES_REPEATABILITY:g} times the repeatability, but at least 0.02 % of the stroke. Repeatability: "
         f"{length(axis.records[0].repeatability_rms)}, {axis.records[0].repeatability_source}."
     )
     return header, rows, None, caption
@@ -398,7 +376,7 @@ def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
         [(PARTS[cause], f"{part * 1e9:.1f}", tracking.advice(cause)) for cause, part in _parts(tracking).items()],
         caption="Rms by which each part enters the whole; of parts that cancel, the smaller one is left out.",
     )
-    chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, TRACKING_ERROR, 1.2)], "column", 540)
+    chart = over_time(TRACKING_ERROR)
     error = tracking.whole
     t, desired = tracking.t, tracking.desired
     kept = thin_line(desired, error)
@@ -407,8 +385,7 @@ def _show_tracking(page: Page, name: str, tracking: Tracking) -> None:
     chart.line(1, "measured - desired", t[kept], error[kept], MEASURED, width=1.2)
     for cause, part in tracking.parts.items():
         if part.any():
-            some = thin_line(part)
-            chart.line(1, PARTS[cause], t[some], part[some], COLOUR[cause], width=1.0)
+            chart.thinned(1, PARTS[cause], t, part, COLOUR[cause], width=1.0)
     said = views.focus(chart, (1,), [error])
     show_steps(page, name, tracking.steps)
     page.chart(f"{name}-tracking", chart, f"Desired and measured displacement, and the parts of the error. {said}")

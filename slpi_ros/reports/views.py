@@ -8,6 +8,7 @@ import numpy as np
 from scipy import signal
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
+from slpi_ros.arrays.rates import slopes
 from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.design_matrix import Walk
 from slpi_ros.identification.drive import hold_band, resting, smallest_turn
@@ -31,6 +32,8 @@ from slpi_ros.reports.chart import (
     Chart,
     Panel,
     Quantity,
+    over_time,
+    sequences,
     thin_cloud,
     thin_line,
 )
@@ -84,7 +87,7 @@ class Motion:
         stops = np.unique(np.concatenate([[0], runs, _arrivals(v, runs), rests]))
         last = stops[np.searchsorted(stops, np.arange(v.size), side="right") - 1]
         branch_from = Walk.along(_monotone_between(v, runs), symmetric_rest=False, primed=False).v_origin
-        return cls(_speed(t, v), t - t[last], branch_from, runs)
+        return cls(slopes(t, v, _REACH), t - t[last], branch_from, runs)
 
 
 def _arrivals(v: FloatArray, runs: IntArray) -> IntArray:
@@ -103,13 +106,6 @@ def _monotone_between(v: FloatArray, runs: IntArray) -> FloatArray:
         further = np.maximum if v[stop] > v[start] else np.minimum
         clean[start : stop + 1] = further.accumulate(clean[start : stop + 1])
     return clean
-
-
-def _speed(t: FloatArray, v: FloatArray) -> FloatArray:
-    here = np.arange(v.size)
-    before, after = np.maximum(here - _REACH, 0), np.minimum(here + _REACH, v.size - 1)
-    step = t[after] - t[before]
-    return np.divide(v[after] - v[before], step, out=np.zeros(v.size), where=step > 0.0)
 
 
 @dataclass(frozen=True)
@@ -136,7 +132,7 @@ def show_model(
     motion, models = Motion.of(t, v), [Series("model", simulated, AFTER)]
     chart, said = loops(v, y, models, motion, fitted)
     page.chart(f"{name}-loops", chart, f"{LOOPS} {said}")
-    chart, said = over_time(t, y, models, noise, fitted=fitted)
+    chart, said = model_over_time(t, y, models, noise, fitted=fitted)
     unused = "" if fitted.all() else f" Shaded: {UNUSED}."
     page.chart(f"{name}-time", chart, f"Over time; the grey band is plus or minus the repeatability.{unused} {said}")
     chart, said = over_voltage(v, y - simulated, motion, noise, fitted)
@@ -209,7 +205,7 @@ def _some_runs(v: FloatArray, y: FloatArray, motion: Motion) -> tuple[FloatArray
     return np.concatenate(samples), f"Of {count} branches one in {every} is drawn."
 
 
-def over_time(
+def model_over_time(
     t: FloatArray,
     y: FloatArray,
     models: Sequence[Series],
@@ -220,17 +216,18 @@ def over_time(
     """Draw displacement and residuals of models over time, with the `parts` of the first; not `fitted` is shaded."""
     # `noise` (m) is the half-width of the shaded band, 0: none. The text is a note on the number of samples outside the
     # initial view, or "".
-    chart = Chart([Panel(TIME, DISPLACEMENT), Panel(TIME, ERROR, 1.2)], "column", 540)
-    for start, stop in _rows(np.zeros(t.size, dtype=bool) if fitted is None else ~fitted):
+    chart = over_time(ERROR)
+    first, after = sequences(np.zeros(t.size, dtype=bool) if fitted is None else ~fitted)
+    for start, stop in zip(t[first].tolist(), t[np.minimum(after, t.size - 1)].tolist(), strict=True):
         for panel in (0, 1):
-            chart.span(panel, UNUSED, float(t[start]), float(t[stop]), UNUSED_SHADE)
+            chart.span(panel, UNUSED, start, stop, UNUSED_SHADE)
     left = [y - model.values for model in models]
     kept = thin_line(y, *left)
     chart.line(0, "measured", t[kept], y[kept], MEASURED, width=2.6)
     for model in models:
         chart.line(0, model.name, t[kept], model.values[kept], model.colour, width=1.0)
-    first, *others = zip(models, left, strict=True)
-    chart.line(1, first[0].name, t[kept], first[1][kept], first[0].colour, width=0.8)
+    (model, error), *others = zip(models, left, strict=True)
+    chart.line(1, model.name, t[kept], error[kept], model.colour, width=0.8)
     # Drawn above the total residual and below the smaller residuals.
     for part in parts:
         some = thin_line(part.values, most=LINE_POINTS // 2)
@@ -239,13 +236,6 @@ def over_time(
         chart.line(1, model.name, t[kept], error[kept], model.colour, width=0.8)
     chart.band(1, noise)
     return chart, focus(chart, (1,), left)
-
-
-def _rows(chosen: Mask) -> list[tuple[int, int]]:
-    """Return first and end sample of each sequence of `chosen` samples, shape (N,)."""
-    steps = np.diff(np.pad(chosen, 1).astype(np.int8))
-    first, after = np.flatnonzero(steps > 0), np.flatnonzero(steps < 0)
-    return list(zip(first.tolist(), np.minimum(after, chosen.size - 1).tolist(), strict=True))
 
 
 def over_voltage(v: FloatArray, left: FloatArray, motion: Motion, noise: float, fitted: Mask) -> tuple[Chart, str]:
@@ -287,11 +277,8 @@ def histogram(chart: Chart, panel: int, curve: Series) -> None:
         return
     low, high = float(x.min()), float(x.max())
     inner = float(np.subtract(*np.percentile(x, _INNER[::-1])))
-    classes = (
-        int(np.clip(np.ceil(_HISTOGRAM_CLASSES * (high - low) / inner), 1, 10 * _HISTOGRAM_CLASSES))
-        if inner > 0.0
-        else 1
-    )
+    classes = np.ceil(_HISTOGRAM_CLASSES * (high - low) / inner) if inner > 0.0 else 1.0
+    classes = int(np.clip(classes, 1, 10 * _HISTOGRAM_CLASSES))
     width = max((high - low) / classes, 1e-12)
     counts, edges = np.histogram(x, np.linspace(low - width, high + width, classes + 3))
     chart.steps(panel, curve.name, edges, counts.astype(np.float64), curve.colour)
@@ -395,11 +382,8 @@ def _means(x: FloatArray, values: FloatArray, *, alike: bool = False) -> tuple[F
 
 def _joined(lines: Sequence[tuple[FloatArray, FloatArray]]) -> tuple[FloatArray, FloatArray]:
     """Return the lines concatenated, with NaN between them."""
-    gap = np.array([np.nan])
-    x, y = zip(*lines, strict=True)
-    return np.concatenate([part for one in x for part in (one, gap)]), np.concatenate(
-        [part for one in y for part in (one, gap)]
-    )
+    x, y = (np.concatenate([np.append(line, np.nan) for line in each]) for each in zip(*lines, strict=True))
+    return x, y
 
 
 def _rate(t: FloatArray) -> float:

@@ -72,20 +72,15 @@ class Character:
         return any((self.temperature_offset, self.temperature_gain, self.load_offset, self.load_gain))
 
 
-# The parameter that sets the strength of each effect.
+# The parameter that sets the strength of each effect: mostly that of its name.
+_OTHERWISE = {"cross_coupling": "coupling", "sensor_periodic": "sensor_amplitude", "hum": "hum_amplitude"}
 STRENGTHS = {
-    "delay": "delay",
-    "lag": "lag",
-    "saturation": "saturation",
-    "rate_dependence": "rate_dependence",
-    "creep": "creep",
-    "resonance": "resonance",
-    "cross_coupling": "coupling",
-    "thermal_drift": "thermal_drift",
-    "gain_drift": "gain_drift",
-    "sensor_periodic": "sensor_amplitude",
-    "hum": "hum_amplitude",
-}
+    name: _OTHERWISE.get(name, name)
+    for name in (
+        "delay", "lag", "saturation", "rate_dependence", "creep", "resonance", "cross_coupling", "thermal_drift",
+        "gain_drift", "sensor_periodic", "hum",
+    )
+}  # fmt: skip
 PLAIN = Character()
 SENSOR_PERIODS = (158e-9, 266e-9, 316e-9, 388e-9, 633e-9)
 

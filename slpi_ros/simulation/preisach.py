@@ -2,23 +2,12 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import UsageError
 from slpi_ros.simulation.parameters import AxisParameters
-
-
-class Material(Protocol):
-    """Relay density and reversible curve of a piezo material."""
-
-    def density(self, bias: FloatArray, width: FloatArray) -> FloatArray:
-        """Return relay weights by bias and width (V), arbitrary unit, for RelayTriangle."""
-
-    def reversible(self, voltage: float) -> float:
-        """Return the displacement without memory, arbitrary unit, at a voltage (V)."""
 
 
 class ExponentialMaterial:
@@ -92,6 +81,9 @@ class PowerLawMaterial:
         ratio = np.divide(np.clip(down, 0.0, up), up, out=np.ones_like(up), where=up > 0)
         fall = (1 - ratio**p) / p - (1 - ratio ** (m + 1)) / (m + 1)
         return np.asarray(up**p * fall / (m + 1 - p), dtype=np.float64)
+
+
+Material = ExponentialMaterial | PowerLawMaterial
 
 
 def material(parameters: AxisParameters) -> Material:

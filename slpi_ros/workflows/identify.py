@@ -43,12 +43,7 @@ class IdentifyOutcome:
         request, source = self.request, self.request.source
         return {
             axis: cross_validate(
-                self._corrected(axis),
-                axis,
-                request.kind,
-                loops_at_rest=request.loops_at_rest,
-                start=source.start,
-                stop=source.stop,
+                self._corrected(axis), axis, request.kind, loops_at_rest=request.loops_at_rest, **source.span
             )
             for axis in self.model.axes
         }
@@ -56,10 +51,7 @@ class IdentifyOutcome:
     def uncertainty(self) -> dict[str, CurveUncertainty]:
         """Return the uncertainty of the curves of each axis."""
         kind, source = self.request.kind, self.request.source
-        return {
-            axis: curve_uncertainty(self._corrected(axis), axis, kind, start=source.start, stop=source.stop)
-            for axis in self.model.axes
-        }
+        return {axis: curve_uncertainty(self._corrected(axis), axis, kind, **source.span) for axis in self.model.axes}
 
     def _corrected(self, axis: str) -> list[Record]:
         sensor = self.request.sensor
@@ -73,20 +65,14 @@ def identify(request: IdentifyRequest) -> IdentifyOutcome:
     records = replace(source, surroundings=source.surroundings or ()).read()
     found = require_records(records, source, {axis: sensor for record in records for axis in record.axes})
     model = fit.identify(
-        records,
-        request.kind,
-        start=source.start,
-        stop=source.stop,
-        axes=source.axes,
-        loops_at_rest=request.loops_at_rest,
-        sensor_delay=sensor.delay,
-        sensor_lag=sensor.lag,
-    )
+        records, request.kind, **source.span, axes=source.axes, loops_at_rest=request.loops_at_rest,
+        sensor_delay=sensor.delay, sensor_lag=sensor.lag,
+    )  # fmt: skip
     unmoved: Sequence[str] = ()
     if source.surroundings:
         # The diagnosis takes a fifth of a second to load.
         from slpi_ros.diagnosis.diagnose import following
 
         require_causes(records, source)
-        model, unmoved = following(records, model, start=source.start, stop=source.stop)
+        model, unmoved = following(records, model, **source.span)
     return IdentifyOutcome(request, model, records, found, unmoved)

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import Any
 
 from slpi_ros.diagnosis.prepare import no_cause, uncovered
 from slpi_ros.errors import IdentificationError, ModelError, RecordError, SlpiError, UsageError
@@ -41,6 +42,11 @@ class Source:
     assessed: bool = False  # `assess_record` has found the axes in use usable already
     surroundings: Sequence[str] | None = None  # recorded quantities, TOPIC[:FIELD]; default: all that can be one
     accept_stage: str = ""  # name of a stage that is taken for that of the model and the other records
+
+    @property
+    def span(self) -> dict[str, Any]:
+        """Start and stop of the part in use, by name."""
+        return {"start": self.start, "stop": self.stop}
 
     def read(self, *, coupled: bool = False, stage: str = "") -> tuple[Record, ...]:
         """Return the records; with `coupled`, also axes that are not in use, which may couple into the others.

@@ -63,7 +63,7 @@ def test_a_changed_bag_is_another(tmp_path):
 def test_complete_bags(tmp_path):
     touch(tmp_path / "done" / "metadata.yaml")
     touch(tmp_path / "growing" / "growing_0.mcap")
-    touch(tmp_path / "end.mcap", b"anything\x89MCAP0\r\n")
+    touch(tmp_path / "end.mcap", b"anything else\x89MCAP0\r\n")
     touch(tmp_path / "cut.mcap", b"anything")
     found = find_bags([tmp_path])
     now = max(bag.modified for bag in found) * 1e-9

@@ -22,6 +22,7 @@ from slpi_ros.model.uncertainty import COMPONENTS
 from slpi_ros.reports import certificate as certificates
 from slpi_ros.reports.uncertainty import PLACES, TIMES
 from slpi_ros.reports.verification import FILES, describe_verification
+from slpi_ros.workflows.verify import VerifyOutcome
 
 NOISE = 8e-9
 BEGINS = datetime(2026, 5, 6, 7, 8, 9, tzinfo=UTC)
@@ -136,8 +137,8 @@ def test_the_budget_takes_quantities_as_they_were_recorded(recorded, folder):
     beside = {"/room" if recorded else "/hall": (times, 21.0 + 2.0 * times / 15.0)}
     record = replace(slpi_ros.read_bag(folder / "today"), surroundings=beside)
     found = slpi_ros.verify(record, model)
-    of = certificates.Verified(found, [record], [str(folder / "today")], model, str(folder / "model.json"))
-    document = certificates.certificate(of)
+    done = VerifyOutcome(found, [record], [])
+    document = certificates.certificate(done, [str(folder / "today")], model, str(folder / "model.json"))
     certificates.write_files(folder / "follows", document)
     text = (folder / "follows" / "certificate.html").read_text()
     budget, (kept,) = document["axes"]["x"]["uncertainty"], document["records"]

@@ -32,15 +32,12 @@ class GcsSimulator(StreamSimulator):
     ----------
     axes : names of the axes; output channels are numbered from 1
     stage : what moves; by default a random one
-    voltage_range : own range, V
-    voltages : at the outputs at the start, V
     servo : whether the servo is on at the start
     units_per_volt : of ``SVA``, which is not in volts on every controller
     without : commands that this controller has not got
     unit : in which it counts positions, and which ``PUN?`` tells; one of `UNITS`
     serial : its serial number
-    answer_delay : time until an answer, s
-    place : host and port, or the path of a pseudo terminal
+    named : what every device has, and where to serve: `host` and `port`, or the `path` of a pseudo terminal
     """
 
     usual_axes, usual_address = ("1",), "127.0.0.1:50000"
@@ -51,19 +48,14 @@ class GcsSimulator(StreamSimulator):
         axes: Sequence[str] = ("1",),
         stage: Stage | None = None,
         *,
-        voltage_range: tuple[float, float] = (-20.0, 120.0),
-        voltages: Sequence[float] | None = None,
         servo: bool = False,
         units_per_volt: float = 1.0,
         without: Sequence[str] = (),
         unit: str = "UM",
         serial: str = SERIAL,
-        answer_delay: float = 0.0,
-        **place: Any,
+        **named: Any,
     ) -> None:
-        super().__init__(
-            axes, stage, voltage_range=voltage_range, voltages=voltages, answer_delay=answer_delay, **place
-        )
+        super().__init__(axes, stage, **{"voltage_range": (-20.0, 120.0), **named})
         self.servo = dict.fromkeys(self.axes, servo)
         self.online = dict.fromkeys(self.axes, True)
         self.units_per_volt = units_per_volt

@@ -10,25 +10,14 @@ import struct
 import threading
 import time
 from collections.abc import Sequence
+from typing import Any
 
 from pymodbus.constants import ExcCodes
 from pymodbus.server import ModbusTcpServer
 from pymodbus.simulator import DataType, SimData, SimDevice
 
-from slpi_ros.simulation.devices.base import (
-    ERROR,
-    HALF,
-    LATE,
-    LOST,
-    NONSENSE,
-    NOT_FINITE,
-    SILENT,
-    TWICE,
-    VOLTS_PER_METRE,
-    WRONG_AXIS,
-    Fault,
-    SimulatedDevice,
-)
+from slpi_ros.simulation.devices import base
+from slpi_ros.simulation.devices.base import Fault, SimulatedDevice
 from slpi_ros.simulation.stage import Stage
 
 # First register and number of registers of what is there.
@@ -48,12 +37,11 @@ class LabjackSimulator(SimulatedDevice):
     ----------
     axes : OUTPUT:INPUT or OUTPUT:INPUT:INPUT, as the driver's channels: how the stage is wired
     stage : what moves; by default a random one
-    voltages : at the outputs at the start, V
     gain : of the amplifier behind the outputs
     product : 7 or 8
     watchdog : values of its registers by their address
-    answer_delay : time until an answer, s
     port : TCP port; 0 for a free one
+    named : what every device has
     """
 
     usual_axes, usual_address = ("DAC0:AIN0",), "127.0.0.1:5020"
@@ -64,17 +52,14 @@ class LabjackSimulator(SimulatedDevice):
         axes: Sequence[str] = ("DAC0:AIN0",),
         stage: Stage | None = None,
         *,
-        voltages: Sequence[float] | None = None,
         gain: float = 20.0,
         product: int = 7,
         watchdog: dict[int, int] | None = None,
-        answer_delay: float = 0.0,
         host: str = "127.0.0.1",
         port: int = 0,
+        **named: Any,
     ) -> None:
-        super().__init__(
-            axes, stage, voltage_range=RANGES[product], voltages=voltages, gain=gain, answer_delay=answer_delay
-        )
+        super().__init__(axes, stage, voltage_range=RANGES[product], gain=gain, **named)
         self.watchdog = watchdog or {}
         self._product, self._host, self._port = product, host, port
         self._fault: Fault | None = None
@@ -152,19 +137,19 @@ class LabjackSimulator(SimulatedDevice):
         fault, self._fault = self._fault, None
         if fault is None:
             return data
-        if fault.kind == LATE:
+        if fault.kind == base.LATE:
             time.sleep(fault.seconds)
-        if fault.kind == LOST:
+        if fault.kind == base.LOST:
             self._refused_until = time.monotonic() + fault.seconds
             self._disconnect()
             return b""
         number = int.from_bytes(data[:2], "big")
         return {
-            SILENT: b"",
-            HALF: data[: len(data) // 2],
-            WRONG_AXIS: (number ^ 1).to_bytes(2, "big") + data[2:],
-            TWICE: data + data,
-            NONSENSE: b"\xff\x00<html>=1e\n" * 3,
+            base.SILENT: b"",
+            base.HALF: data[: len(data) // 2],
+            base.WRONG_AXIS: (number ^ 1).to_bytes(2, "big") + data[2:],
+            base.TWICE: data + data,
+            base.NONSENSE: b"\xff\x00<html>=1e\n" * 3,
         }.get(fault.kind, data)
 
     # Registers
@@ -176,7 +161,7 @@ class LabjackSimulator(SimulatedDevice):
         name = self._name_of(address)
         self.received.append(f"{'write' if values else 'read'} {name} {address} {count}")
         self._fault = self.due(name) if values is None else self.due("write")
-        if self._fault is not None and self._fault.kind == ERROR:
+        if self._fault is not None and self._fault.kind == base.ERROR:
             self._fault = None
             return ExcCodes.DEVICE_FAILURE
         if values is not None:
@@ -208,8 +193,8 @@ class LabjackSimulator(SimulatedDevice):
             return struct.pack(">f", self.voltage(self._outputs[address]))
         if address in self._inputs:
             axis, sensor = self._inputs[address]
-            value = measured[axis] * VOLTS_PER_METRE if sensor else self.voltage(axis)
-            if self._fault is not None and self._fault.kind == NOT_FINITE:
+            value = measured[axis] * base.VOLTS_PER_METRE if sensor else self.voltage(axis)
+            if self._fault is not None and self._fault.kind == base.NOT_FINITE:
                 value = float("nan")
             return struct.pack(">f", value)
         return struct.pack(">f", 0.0)

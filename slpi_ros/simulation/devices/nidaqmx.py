@@ -15,19 +15,8 @@ import grpc
 from nidaqmx._stubs import nidaqmx_pb2 as types
 from nidaqmx._stubs import nidaqmx_pb2_grpc as service
 
-from slpi_ros.simulation.devices.base import (
-    ERROR,
-    HALF,
-    LATE,
-    LOST,
-    NONSENSE,
-    NOT_FINITE,
-    SILENT,
-    TWICE,
-    VOLTS_PER_METRE,
-    WRONG_AXIS,
-    SimulatedDevice,
-)
+from slpi_ros.simulation.devices import base
+from slpi_ros.simulation.devices.base import SimulatedDevice
 from slpi_ros.simulation.stage import Stage
 
 DEVICE = "Dev1"
@@ -107,7 +96,7 @@ class NidaqmxSimulator(SimulatedDevice):
     def read(self, name: str, measured: dict[str, float]) -> float:
         """Return the voltage (V) at an input."""
         axis, sensor = self.inputs[name]
-        return measured[axis] * VOLTS_PER_METRE if sensor else self.voltage(axis)
+        return measured[axis] * base.VOLTS_PER_METRE if sensor else self.voltage(axis)
 
 
 class _Service(service.NiDAQmxServicer):  # type: ignore[misc]
@@ -134,14 +123,14 @@ class _Service(service.NiDAQmxServicer):  # type: ignore[misc]
         fault = device.due(name)
         if fault is None:
             return ""
-        if fault.kind == LOST:
+        if fault.kind == base.LOST:
             device.refused_until = time.monotonic() + fault.seconds
             context.abort(grpc.StatusCode.UNAVAILABLE, "the link was lost")
-        if fault.kind in (LATE, SILENT):
-            time.sleep(fault.seconds if fault.kind == LATE else 0.6)
-            if fault.kind == SILENT:
+        if fault.kind in (base.LATE, base.SILENT):
+            time.sleep(fault.seconds if fault.kind == base.LATE else 0.6)
+            if fault.kind == base.SILENT:
                 context.abort(grpc.StatusCode.CANCELLED, "nobody waits any more")
-        if fault.kind == ERROR:
+        if fault.kind == base.ERROR:
             self._fail(context, -200361, "The device has failed.")
         return fault.kind
 
@@ -285,11 +274,11 @@ class _Service(service.NiDAQmxServicer):  # type: ignore[misc]
                 rows = [[device.read(name, measured) for name in task.inputs]]
         values = [row[n] for n in range(len(task.inputs)) for row in rows]
         values = {
-            HALF: values[: len(values) // 2],
-            WRONG_AXIS: [*values, 1.0],
-            TWICE: values + values,
-            NONSENSE: [1e300] * len(values),
-            NOT_FINITE: [float("nan")] * len(values),
+            base.HALF: values[: len(values) // 2],
+            base.WRONG_AXIS: [*values, 1.0],
+            base.TWICE: values + values,
+            base.NONSENSE: [1e300] * len(values),
+            base.NOT_FINITE: [float("nan")] * len(values),
         }.get(kind, values)
         return types.ReadAnalogF64Response(read_array=values, samps_per_chan_read=len(rows))
 

@@ -82,7 +82,8 @@ def fmu(stage: ExportedStage, unit: Unit, version: str) -> bytes:
     ]
     context: dict[str, Any] = {
         "limits": [(repr(axis.allowed.lower), repr(axis.allowed.upper)) for axis in stage.axes] if loops else [],
-        "quantities": stage.quantities, "limited": unit.limited(stage), "longest": repr(MAX_DT), "most": repr(LONGEST_STEP),
+        "quantities": stage.quantities, "limited": unit.limited(stage), "longest": repr(MAX_DT),
+        "most": repr(LONGEST_STEP),
         "version": version, "what": unit.what, "file": file, "token": f"{{{token}}}", "variables": variables,
         "function": unit.function, "identifier": unit.identifier,
         "step": repr(loops[0].period if loops else STEP),

@@ -19,7 +19,14 @@ from slpi_ros.model.limits import MAX_DT
 
 # More than any number of a model: none. Turning points that are remembered, unless the compiler is told otherwise.
 NONE, TURNS = 1e30, 64
-C_FILES = ("slpi_inverse.h", "slpi_inverse.c")
+# Effects behind the hysteresis, in their order, and the condition in C that an axis has them.
+BEHIND = {
+    "creep": "a->relaxations > 0",
+    "contact": "a->contact_position < SLPI_NONE",
+    "modes": "a->modes > 0",
+    "heating": "a->heat_gain != R(0.0)",
+    "surroundings": "a->quantities > 0",
+}
 LIBM = "fabs, floor, sqrt, exp, expm1, sin, cos, asinh, sinh (with an f for float)"
 
 
@@ -32,7 +39,6 @@ def _features(stage: ExportedStage) -> dict[str, bool]:
         "rate": any(one.rate.size for one in laws),
         "creep": any(one.relaxations.size for one in laws),
         "modes": any(one.modes.size for one in laws),
-        "factors": any(one.factors.size for one in laws),
         "heating": any(one.heating.size and one.heating[0] for one in laws),
         "surroundings": bool(stage.quantities),
         "composed": any(axis.branches.operators.size for axis in stage.axes),
@@ -185,7 +191,7 @@ class _Tables:
             self._add("creep_gain", laws.relaxations[1])
         self._numbers(contact_position=laws.contact[0], contact_gain=laws.contact[1])
         if has["modes"]:
-            self._counts(modes=len(laws.modes), factors=len(laws.factors))
+            self._counts(modes=len(laws.modes))
             self._numbers(beside_modes=laws.rest)
             for name, width, rows in (("mode", 3, laws.modes[:, 1:]), ("factor", 8, laws.factors)):
                 text = _rows(f"{self._prefix}_{name}", width, rows) if rows.size else ""
@@ -249,6 +255,7 @@ def context_of(stage: ExportedStage) -> Mapping[str, Any]:
     lines += [line for axis in stage.axes for line in axis.describe]
     return {
         "has": has,
+        "behind": [(part, used) for part, used in BEHIND.items() if has.get(part, True)],
         "axes": axes,
         "about": [comment(line) for line in lines],
         "stack_bound": _stack_bound(stage),
@@ -263,7 +270,6 @@ def context_of(stage: ExportedStage) -> Mapping[str, Any]:
         "most": {
             "relaxations": max(one.relaxations.shape[1] for one in laws),
             "modes": max(len(one.modes) for one in laws),
-            "factors": max(len(one.factors) for one in laws),
             "operators": operators,
             "knots": 4 * operators + 2,
             "quantities": max(len(axis.surroundings.quantities) if axis.surroundings else 0 for axis in stage.axes),

@@ -4,6 +4,7 @@ import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache
 from math import isinf
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -11,6 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import ArrayLike, NDArray
 
 from slpi_ros.arrays import FloatArray
+from slpi_ros.compensator.loop_filter import Section
 from slpi_ros.effects.filters import DAMPING, WIDEST
 from slpi_ros.export.feedback import ExportedLoop
 from slpi_ros.export.stage import HISTORY, ExportedAxis, ExportedStage
@@ -19,31 +21,23 @@ from slpi_ros.model.limits import MAX_DT
 
 # More than any number of a model: none. Turning points that are remembered, unless the compiler is told otherwise.
 NONE, TURNS = 1e30, 64
-# Effects behind the hysteresis, in their order, and the condition in C that an axis has them.
-BEHIND = {
-    "creep": "a->relaxations > 0",
-    "contact": "a->contact_position < SLPI_NONE",
-    "modes": "a->modes > 0",
-    "heating": "a->heat_gain != R(0.0)",
-    "surroundings": "a->quantities > 0",
-}
 LIBM = "fabs, floor, sqrt, exp, expm1, sin, cos, asinh, sinh (with an f for float)"
 
 
-def _features(stage: ExportedStage) -> dict[str, bool]:
+def _features(stage: ExportedStage) -> SimpleNamespace:
     """Return what any axis of the stage has, by which parts of the source are there."""
     laws = [axis.laws for axis in stage.axes]
-    return {
-        "lag": any(one.lag > 0.0 for one in laws),
-        "slew": any(one.slew < np.inf for one in laws),
-        "rate": any(one.rate.size for one in laws),
-        "creep": any(one.relaxations.size for one in laws),
-        "modes": any(one.modes.size for one in laws),
-        "heating": any(one.heating.size and one.heating[0] for one in laws),
-        "surroundings": bool(stage.quantities),
-        "composed": any(axis.branches.operators.size for axis in stage.axes),
-        "coupling": bool(stage.gains.any()),
-    }
+    return SimpleNamespace(
+        lag=any(one.lag > 0.0 for one in laws),
+        slew=any(one.slew < np.inf for one in laws),
+        rate=any(one.rate.size for one in laws),
+        creep=any(one.relaxations.size for one in laws),
+        modes=any(one.modes.size for one in laws),
+        heating=any(one.heating.size and one.heating[0] for one in laws),
+        surroundings=bool(stage.quantities),
+        composed=any(axis.branches.operators.size for axis in stage.axes),
+        coupling=bool(stage.gains.any()),
+    )
 
 
 def number(value: float) -> str:
@@ -78,7 +72,7 @@ def _matrix(values: NDArray[np.floating[Any]]) -> str:
 class _Tables:
     """Tables of one axis, and the fields of its struct: declaration and value, by name."""
 
-    def __init__(self, axis: ExportedAxis, place: int, has: Mapping[str, bool], numbers: Mapping[str, int]) -> None:
+    def __init__(self, axis: ExportedAxis, place: int, has: SimpleNamespace, numbers: Mapping[str, int]) -> None:
         self._axis, self._prefix, self._has, self._quantities = axis, f"slpi_{place}", has, numbers
         self.tables: list[str] = []
         self.fields: dict[str, tuple[str, str]] = {}
@@ -155,7 +149,7 @@ class _Tables:
         for name, values in (("first", first), ("last", last)):
             self._refer(f"const int *{name}", name, _integers(f"{self._prefix}_{name}", values) if values else "")
         self._counts(count=branches.vertices.shape[1], base_first=place)
-        if self._has["composed"]:
+        if self._has.composed:
             empty = np.empty((2, 0))
             operators = branches.operators if branches.operators.ndim == 2 else empty
             self._add("thresholds", operators[0] if operators.size else [])
@@ -175,31 +169,31 @@ class _Tables:
         chain = axis.model.chain
         moving = [effect for effect in (*chain.before, *chain.own) if effect.streaming() is not None]
         self._counts(dynamic=bool(moving))
-        if has["lag"]:
+        if has.lag:
             self._numbers(lag=laws.lag)
-        if has["slew"]:
+        if has.slew:
             self._numbers(amplifier_slew=laws.slew)
-        if has["rate"]:
+        if has.rate:
             self._counts(has_rate=laws.rate.size > 0)
             threshold, onset, gain = laws.rate.tolist() if laws.rate.size else (0.0, 0.0, 0.0)
             self._numbers(threshold=threshold, onset_rate=onset, reversible_gain=gain)
-        if has["creep"]:
+        if has.creep:
             from_start = isinf(laws.rest_of_creep)
             self._counts(relaxations=laws.relaxations.shape[1], creep_from_start=from_start)
             self._numbers(creep_origin=0.0 if from_start else laws.rest_of_creep)
             self._add("creep_tau", laws.relaxations[0])
             self._add("creep_gain", laws.relaxations[1])
         self._numbers(contact_position=laws.contact[0], contact_gain=laws.contact[1])
-        if has["modes"]:
+        if has.modes:
             self._counts(modes=len(laws.modes))
             self._numbers(beside_modes=laws.rest)
             for name, width, rows in (("mode", 3, laws.modes[:, 1:]), ("factor", 8, laws.factors)):
                 text = _rows(f"{self._prefix}_{name}", width, rows) if rows.size else ""
                 self._refer(f"const slpi_real (*{name})[{width}]", name, text)
-        if has["heating"]:
+        if has.heating:
             gain, tau, origin, most = laws.heating.tolist() if laws.heating.size else (0.0, 1.0, 0.0, 0.0)
             self._numbers(heat_gain=gain, heat_tau=tau, heat_origin=origin, heat_most=most)
-        if has["surroundings"]:
+        if has.surroundings:
             self._surroundings()
         self._numbers(gain_origin=laws.gain[0], gain_factor=laws.gain[1])
 
@@ -250,12 +244,11 @@ def context_of(stage: ExportedStage) -> Mapping[str, Any]:
             "fields": made.fields,
         })  # fmt: skip
     operators = max(axis.branches.operators.shape[1] if axis.branches.operators.ndim == 2 else 0 for axis in stage.axes)
-    conditions = ["a->lag > R(0.0)"] * has["lag"] + ["a->amplifier_slew < SLPI_NONE"] * has["slew"]
+    conditions = ["a->lag > R(0.0)"] * has.lag + ["a->amplifier_slew < SLPI_NONE"] * has.slew
     lines = [f"model of {stage.model.created or 'unknown time'}, hardware '{stage.model.hardware_id}'"]
     lines += [line for axis in stage.axes for line in axis.describe]
     return {
         "has": has,
-        "behind": [(part, used) for part, used in BEHIND.items() if has.get(part, True)],
         "axes": axes,
         "about": [comment(line) for line in lines],
         "stack_bound": _stack_bound(stage),
@@ -291,14 +284,14 @@ def _feedback(loops: Sequence[ExportedLoop]) -> dict[str, Any] | None:
     """Return what the templates say of the feedback; None without one."""
     if not loops:
         return None
-    rows, laws = list[FloatArray](), []
+    rows, laws = list[Section](), []
     for loop in loops:
         own, gains = loop.sections, loop.gains
         values = (gains.proportional, gains.integral, gains.derivative, loop.moved, loop.most)
         laws.append(f"{{{len(rows)}, {len(own)}, {', '.join(map(number, values))}}}")
-        rows += [np.array([one.b0, one.b1, one.b2, one.a1, one.a2]) for one in own]
+        rows += own
     return {
-        "rows": ["{" + ", ".join(map(number, row)) + "}" for row in rows or [np.zeros(5)]],
+        "rows": ["{" + ", ".join(map(number, row)) + "}" for row in rows or [Section(0.0, 0.0, 0.0, 0.0, 0.0)]],
         "laws": laws,
         "period": repr(loops[0].period),
         "released": repr(loops[0].released),

@@ -35,10 +35,20 @@ def resolved(omega: float) -> float:
     return 4.0 * SPACING / ((HISTORY - 4) * omega)
 
 
-# The fields of `slpi_ros.effects.paths.Laws` that the exported inverse has.
-KNOWN = frozenset((
-    "lag", "slew", "rate", "relaxations", "rest_of_creep", "contact", "modes", "rest", "factors", "heating", "gain",
-))  # fmt: skip
+class Known(NamedTuple):
+    """The fields of `slpi_ros.effects.paths.Laws` that the exported inverse has, in its order."""
+
+    lag: float
+    slew: float
+    rate: FloatArray
+    relaxations: FloatArray
+    rest_of_creep: float
+    contact: FloatArray
+    modes: FloatArray
+    rest: float
+    factors: FloatArray
+    heating: FloatArray
+    gain: FloatArray
 
 
 class Base(NamedTuple):
@@ -72,7 +82,7 @@ class ExportedAxis:
                 known = bool(effect.shift) or effect.passes != (-inf, inf) or effect.acts_on == "voltage"
             else:
                 laws = effect.laws()
-                known = isinstance(effect, Surroundings) or (bool(laws) and KNOWN.issuperset(laws or {}))
+                known = isinstance(effect, Surroundings) or (bool(laws) and set(laws or {}) <= set(Known._fields))
             refused += [] if known else [effect.name]
         refused += [effect.name for effect in chain.shared if not effect.coupling]
         if refused:

@@ -79,8 +79,7 @@ def notches_of(
     return found
 
 
-@dataclass(frozen=True)
-class Section:
+class Section(NamedTuple):
     """Second-order section ``(b0 + b1 / z + b2 / z^2) / (1 + a1 / z + a2 / z^2)`` with static gain 1."""
 
     b0: float
@@ -131,7 +130,6 @@ class LoopFilter:
     def __init__(self, notches: tuple[Notch, ...], time_constant: float, period: float) -> None:
         self.period = period
         self.sections = sections(notches, time_constant, period)
-        self._numbers = [(each.b0, each.b1, each.b2, each.a1, each.a2) for each in self.sections]
 
     def at_rest(self, u: float) -> States:
         """Return the states for an input that has always been `u`, as the output then is."""
@@ -145,7 +143,7 @@ class LoopFilter:
         """Return output and states after `steps` (1 or more) periods with the input `u`."""
         for _ in range(steps):
             value, following = u, []
-            for (b0, b1, b2, a1, a2), (first, second) in zip(self._numbers, states, strict=True):
+            for (b0, b1, b2, a1, a2), (first, second) in zip(self.sections, states, strict=True):
                 y = b0 * value + first
                 following.append((b1 * value - a1 * y + second, b2 * value - a2 * y))
                 value = y

@@ -1,7 +1,7 @@
 """The interface of a device: an amplifier together with the sensor of the stage, and what goes wrong with it."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Iterable, Sequence
 from dataclasses import dataclass, replace
 from math import isnan, log10, nan
 
@@ -134,6 +134,19 @@ class Device(ABC):
                 notes.append(f"axis '{channel.name}' counts in {shown(unit)}: sensor_scale {channels[-1].scale:g} m")
         self.channels = tuple(channels)
         return tuple(notes)
+
+    def reading(self, read_ns: int, voltages: Sequence[float], positions: Sequence[float]) -> Reading:
+        """Return what was read at a time (ns), given in the units of the device, one value for each channel."""
+        return Reading(
+            read_ns,
+            tuple(each.stage_volts(v) for each, v in zip(self.channels, voltages, strict=True)),
+            tuple(each.metres(p) for each, p in zip(self.channels, positions, strict=True)),
+        )
+
+    def range_of(self, ends: Iterable[Sequence[float]]) -> tuple[tuple[float, ...], tuple[float, ...]]:
+        """Return lowest and highest voltages at the stage from the ends (V of the device) of each channel."""
+        pairs = [sorted(map(each.stage_volts, own)) for each, own in zip(self.channels, ends, strict=True)]
+        return tuple(low for low, _ in pairs), tuple(high for _, high in pairs)
 
     @abstractmethod
     def open(self) -> Found:

@@ -126,11 +126,7 @@ class GcsDevice(Device):
         told = self._values("VOL?" if self._outputs else "SVA?", lines[count:-1], self._outputs or self._axes)
         if code := self._error(lines[-1]):
             raise RefusedError(f"{self.name}: error {_meaning(code)} after '{command or 'questions only'}'")
-        return Reading(
-            (sent_ns + received_ns) // 2,
-            tuple(each.stage_volts(v) for each, v in zip(self.channels, told, strict=True)),
-            tuple(each.metres(p) for each, p in zip(self.channels, positions, strict=True)),
-        )
+        return self.reading((sent_ns + received_ns) // 2, told, positions)
 
     def close(self) -> None:
         """End the connection; the controller keeps its voltages."""
@@ -222,14 +218,11 @@ class GcsDevice(Device):
             notes.append("it has no VOL?: the voltage is what SVA? says, which cannot be checked to be in volts")
         if not any(servo):
             self._require_agreement(setpoints, told, lowest, highest)
-        gains = [each.stage_volts for each in self.channels]
-        ranges = [sorted((gain(a), gain(b))) for gain, a, b in zip(gains, lowest, highest, strict=True)]
         return Found(
             identity,
             reading,
-            tuple(gain(v) for gain, v in zip(gains, setpoints, strict=True)),
-            tuple(low for low, _ in ranges),
-            tuple(high for _, high in ranges),
+            tuple(each.stage_volts(v) for each, v in zip(self.channels, setpoints, strict=True)),
+            *self.range_of(zip(lowest, highest, strict=True)),
             tuple(servo),
             tuple(notes),
             tuple(units),

@@ -120,13 +120,11 @@ class LabjackDevice(Device):
         notes = self._check_watchdog()
         reading = self.read()
         ranges = [TICK_RANGE if each.address >= TDAC else RANGES[int(product)] for each in self._wires]
-        ends = [sorted(map(channel.stage_volts, each)) for channel, each in zip(self.channels, ranges, strict=True)]
         return Found(
             f"LabJack T{product:g}, serial number {serial}, firmware {firmware:.4f}",
             reading,
             reading.voltages,
-            tuple(low for low, _ in ends),
-            tuple(high for _, high in ends),
+            *self.range_of(ranges),
             (False,) * len(self.channels),
             (*notes, *self._notes()),
         )
@@ -150,15 +148,10 @@ class LabjackDevice(Device):
         positions = self._table("AIN", self._positions)
         received_ns = time.monotonic_ns()
         told = self._table("the outputs", self._voltages)
-        return Reading(
+        return self.reading(
             (sent_ns + received_ns) // 2,
-            tuple(
-                channel.stage_volts(told[address]) for channel, address in zip(self.channels, self._told, strict=True)
-            ),
-            tuple(
-                channel.metres(positions[AIN + 2 * each.position])
-                for channel, each in zip(self.channels, self._wires, strict=True)
-            ),
+            [told[address] for address in self._told],
+            [positions[AIN + 2 * each.position] for each in self._wires],
         )
 
     def close(self) -> None:

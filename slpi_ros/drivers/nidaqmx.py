@@ -101,15 +101,8 @@ class NidaqmxDevice(Device):
             self._read_on_demand()
         reading = self.read()
         self._displaced = False
-        ends = [sorted(map(each.stage_volts, self._range)) for each in self.channels]
-        return Found(
-            identity,
-            reading,
-            reading.voltages,
-            tuple(low for low, _ in ends),
-            tuple(high for _, high in ends),
-            (False,) * len(self.channels),
-        )
+        count = len(self.channels)
+        return Found(identity, reading, reading.voltages, *self.range_of([self._range] * count), (False,) * count)
 
     def release_servo(self) -> Found:
         """Return what the device says: it has no servo."""
@@ -315,11 +308,7 @@ class NidaqmxDevice(Device):
     def _reading(self, values: FloatArray, read_ns: int) -> Reading:
         self._require_volts(values)
         told, places = values.tolist(), len(self.channels)
-        return Reading(
-            read_ns,
-            tuple(each.stage_volts(v) for each, v in zip(self.channels, told[places:], strict=True)),
-            tuple(each.metres(v) for each, v in zip(self.channels, told[:places], strict=True)),
-        )
+        return self.reading(read_ns, told[places:], told[:places])
 
     def _require_volts(self, values: FloatArray) -> None:
         if not np.isfinite(values).all() or np.abs(values).max() > BEYOND * max(INPUT_RANGE, *map(abs, self._range)):

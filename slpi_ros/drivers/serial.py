@@ -55,10 +55,10 @@ class SerialDevice(Device):
         sent_ns = time.monotonic_ns()
         positions = (math.nan,) * len(self.channels)
         if self._dialect.position:
-            positions = tuple(each.metres(self._number(self._dialect.position, each)) for each in self.channels)
+            positions = tuple(self._number(self._dialect.position, each) for each in self.channels)
         received_ns = time.monotonic_ns()
-        told = tuple(each.stage_volts(self._volts(self._dialect.voltage, each)) for each in self.channels)
-        return Reading((sent_ns + received_ns) // 2, told, positions)
+        told = [self._volts(self._dialect.voltage, each) for each in self.channels]
+        return self.reading((sent_ns + received_ns) // 2, told, positions)
 
     def close(self) -> None:
         """End the connection; the device keeps its voltages."""
@@ -78,20 +78,14 @@ class SerialDevice(Device):
                     )
         servo = tuple(bool(dialect.servo and self._number(dialect.servo, each)) for each in self.channels)
         reading = self.read()
-        ranges = [
-            sorted(
-                each.stage_volts(self._volts(query, each)) if query else absent
-                for query, absent in ((dialect.lowest, -math.inf), (dialect.highest, math.inf))
-            )
-            for each in self.channels
-        ]
+        asked = (dialect.lowest, -math.inf), (dialect.highest, math.inf)
+        ranges = [[self._volts(query, each) if query else absent for query, absent in asked] for each in self.channels]
         notes = [] if dialect.position else ["it has no sensor: positions are not a number, which no calibration takes"]
         return Found(
             " ".join(identity.split()),
             reading,
             reading.voltages,
-            tuple(low for low, _ in ranges),
-            tuple(high for _, high in ranges),
+            *self.range_of(ranges),
             servo,
             tuple(notes),
         )

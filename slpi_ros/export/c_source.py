@@ -2,9 +2,9 @@
 
 import re
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
 from functools import cache
 from math import isinf
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -12,6 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from numpy.typing import ArrayLike, NDArray
 
 from slpi_ros.arrays import FloatArray
+from slpi_ros.compensator.loop_filter import Section
 from slpi_ros.effects.filters import DAMPING, WIDEST
 from slpi_ros.export.feedback import ExportedLoop
 from slpi_ros.export.stage import HISTORY, ExportedAxis, ExportedStage
@@ -20,47 +21,23 @@ from slpi_ros.model.limits import MAX_DT
 
 # More than any number of a model: none. Turning points that are remembered, unless the compiler is told otherwise.
 NONE, TURNS = 1e30, 64
-C_FILES = ("slpi_inverse.h", "slpi_inverse.c")
 LIBM = "fabs, floor, sqrt, exp, expm1, sin, cos, asinh, sinh (with an f for float)"
 
 
-@dataclass(frozen=True)
-class Features:
-    """What any axis of the stage has, by which parts of the source are there."""
-
-    lag: bool
-    slew: bool
-    rate: bool
-    creep: bool
-    contact: bool
-    modes: bool
-    factors: bool
-    heating: bool
-    surroundings: bool
-    gain: bool
-    composed: bool
-    limit: bool
-    coupling: bool
-
-    @classmethod
-    def of(cls, stage: ExportedStage) -> "Features":
-        """Return what the axes of a stage have."""
-        laws = [axis.laws for axis in stage.axes]
-        return cls(
-            lag=any(one.lag > 0.0 for one in laws),
-            slew=any(one.slew < np.inf for one in laws),
-            rate=any(one.rate.size for one in laws),
-            creep=any(one.relaxations.size for one in laws),
-            contact=any(one.contact[0] < np.inf for one in laws),
-            modes=any(one.modes.size for one in laws),
-            factors=any(one.factors.size for one in laws),
-            heating=any(one.heating.size and one.heating[0] for one in laws),
-            surroundings=bool(stage.quantities),
-            gain=any(tuple(one.gain) != (0.0, 1.0) for one in laws),
-            composed=any(axis.branches.operators.size for axis in stage.axes),
-            limit=any(not isinf(axis.allowed.slew) for axis in stage.axes),
-            coupling=bool(stage.gains.any()),
-        )
+def _features(stage: ExportedStage) -> SimpleNamespace:
+    """Return what any axis of the stage has, by which parts of the source are there."""
+    laws = [axis.laws for axis in stage.axes]
+    return SimpleNamespace(
+        lag=any(one.lag > 0.0 for one in laws),
+        slew=any(one.slew < np.inf for one in laws),
+        rate=any(one.rate.size for one in laws),
+        creep=any(one.relaxations.size for one in laws),
+        modes=any(one.modes.size for one in laws),
+        heating=any(one.heating.size and one.heating[0] for one in laws),
+        surroundings=bool(stage.quantities),
+        composed=any(axis.branches.operators.size for axis in stage.axes),
+        coupling=bool(stage.gains.any()),
+    )
 
 
 def number(value: float) -> str:
@@ -93,25 +70,33 @@ def _matrix(values: NDArray[np.floating[Any]]) -> str:
 
 
 class _Tables:
-    """Tables and fields of one axis."""
+    """Tables of one axis, and the fields of its struct: declaration and value, by name."""
 
-    def __init__(self, axis: ExportedAxis, place: int, has: Features, numbers: Mapping[str, int]) -> None:
+    def __init__(self, axis: ExportedAxis, place: int, has: SimpleNamespace, numbers: Mapping[str, int]) -> None:
         self._axis, self._prefix, self._has, self._quantities = axis, f"slpi_{place}", has, numbers
         self.tables: list[str] = []
-        self.fields: dict[str, str] = {}
+        self.fields: dict[str, tuple[str, str]] = {}
         self._limits()
         self._curves()
         self._start()
         self._effects()
 
     def _numbers(self, **values: float) -> None:
-        self.fields |= {name: number(value) for name, value in values.items()}
+        self.fields |= {name: (f"slpi_real {name}", number(value)) for name, value in values.items()}
+
+    def _counts(self, **values: int) -> None:
+        self.fields |= {name: (f"int {name}", str(int(value))) for name, value in values.items()}
 
     def _add(self, name: str, values: ArrayLike) -> None:
         """Add a table and the field that leads to it; no values: NULL."""
-        if np.size(values):
-            self.tables.append(table(f"{self._prefix}_{name}", values))
-        self.fields[name] = f"{self._prefix}_{name}" if np.size(values) else "NULL"
+        text = table(f"{self._prefix}_{name}", values) if np.size(values) else ""
+        self._refer(f"const slpi_real *{name}", name, text)
+
+    def _refer(self, declared: str, name: str, text: str) -> None:
+        """Add the definition of a table and the field that leads to it; "": NULL."""
+        if text:
+            self.tables.append(text)
+        self.fields[name] = declared, f"{self._prefix}_{name}" if text else "NULL"
 
     def _limits(self) -> None:
         axis, allowed = self._axis, self._axis.allowed
@@ -121,7 +106,7 @@ class _Tables:
         self._numbers(clip_lower=clipped[0], clip_upper=clipped[1])
         self._numbers(accepted_lower=accepted[0], accepted_upper=accepted[1])
         self._numbers(rest_v=rest[0], rest_y=rest[1], far_y=axis.memory.far)
-        self.fields |= {"primed": str(int(axis.primed)), "symmetric": str(int(symmetric))}
+        self._counts(primed=axis.primed, symmetric=symmetric)
 
     def _curves(self) -> None:
         """Add the curves of all branches, one after the other, the one without a turning point last."""
@@ -144,8 +129,7 @@ class _Tables:
             lines = [f"static const slpi_real {self._prefix}_{name}[] = {{", *_lines(map(number, packed[c].tolist()))]
             lines += ["#ifdef SLPI_FLOAT", *_lines(map(number, near.knots[c].tolist())), "#else"]
             lines += [*_lines(map(number, base.knots[c].tolist())), "#endif", "};"]
-            self.tables.append("\n".join(lines))
-            self.fields[name] = f"{self._prefix}_{name}"
+            self._refer(f"const slpi_real *{name}", name, "\n".join(lines))
             self._add(f"d{name}", np.append(changed[c], zeros))
         prefix = self._prefix.upper()
         self.tables.append(
@@ -159,29 +143,23 @@ class _Tables:
                 "#endif",
             ])
         )  # fmt: skip
-        self.fields["base"] = f"{{{prefix}_BASE}}"
+        self.fields["base"] = "slpi_real base[2]", f"{{{prefix}_BASE}}"
+        self.fields["base_last"] = "int base_last", f"{prefix}_BASE_LAST"
         self._add("vertices", branches.vertices)
-        if first:
-            self.tables.append(_integers(f"{self._prefix}_first", first))
-            self.tables.append(_integers(f"{self._prefix}_last", last))
-        self.fields |= {
-            "first": f"{self._prefix}_first" if first else "NULL",
-            "last": f"{self._prefix}_last" if first else "NULL",
-            "count": str(branches.vertices.shape[1]),
-            "base_first": str(place),
-            "base_last": f"{prefix}_BASE_LAST",
-        }
+        for name, values in (("first", first), ("last", last)):
+            self._refer(f"const int *{name}", name, _integers(f"{self._prefix}_{name}", values) if values else "")
+        self._counts(count=branches.vertices.shape[1], base_first=place)
         if self._has.composed:
             empty = np.empty((2, 0))
             operators = branches.operators if branches.operators.ndim == 2 else empty
             self._add("thresholds", operators[0] if operators.size else [])
             self._add("weights", operators[1] if operators.size else [])
-            self.fields["operators"] = str(operators.shape[1] if operators.size else 0)
+            self._counts(operators=operators.shape[1] if operators.size else 0)
             self._numbers(scale_origin=branches.scale[0], scale_amplitude=branches.scale[1])
 
     def _start(self) -> None:
         start = self._axis.start
-        self.fields |= {"start_direction": str(start.direction), "start_turns": str(len(start.turn_voltages))}
+        self._counts(start_direction=start.direction, start_turns=len(start.turn_voltages))
         self._numbers(start_v=start.voltage, start_y=start.displacement)
         self._add("start_turn_v", start.turn_voltages)
         self._add("start_turn_y", start.turn_displacements)
@@ -190,38 +168,34 @@ class _Tables:
         axis, laws, has = self._axis, self._axis.laws, self._has
         chain = axis.model.chain
         moving = [effect for effect in (*chain.before, *chain.own) if effect.streaming() is not None]
-        self.fields["dynamic"] = str(int(bool(moving)))
+        self._counts(dynamic=bool(moving))
         if has.lag:
             self._numbers(lag=laws.lag)
         if has.slew:
             self._numbers(amplifier_slew=laws.slew)
         if has.rate:
-            self.fields["has_rate"] = str(int(laws.rate.size > 0))
+            self._counts(has_rate=laws.rate.size > 0)
             threshold, onset, gain = laws.rate.tolist() if laws.rate.size else (0.0, 0.0, 0.0)
             self._numbers(threshold=threshold, onset_rate=onset, reversible_gain=gain)
         if has.creep:
-            self.fields["relaxations"] = str(laws.relaxations.shape[1])
             from_start = isinf(laws.rest_of_creep)
-            self.fields["creep_from_start"] = str(int(from_start))
+            self._counts(relaxations=laws.relaxations.shape[1], creep_from_start=from_start)
             self._numbers(creep_origin=0.0 if from_start else laws.rest_of_creep)
             self._add("creep_tau", laws.relaxations[0])
             self._add("creep_gain", laws.relaxations[1])
-        if has.contact:
-            self._numbers(contact_position=laws.contact[0], contact_gain=laws.contact[1])
+        self._numbers(contact_position=laws.contact[0], contact_gain=laws.contact[1])
         if has.modes:
-            self.fields |= {"modes": str(len(laws.modes)), "factors": str(len(laws.factors))}
+            self._counts(modes=len(laws.modes))
             self._numbers(beside_modes=laws.rest)
             for name, width, rows in (("mode", 3, laws.modes[:, 1:]), ("factor", 8, laws.factors)):
-                if rows.size:
-                    self.tables.append(_rows(f"{self._prefix}_{name}", width, rows))
-                self.fields[name] = f"{self._prefix}_{name}" if rows.size else "NULL"
+                text = _rows(f"{self._prefix}_{name}", width, rows) if rows.size else ""
+                self._refer(f"const slpi_real (*{name})[{width}]", name, text)
         if has.heating:
             gain, tau, origin, most = laws.heating.tolist() if laws.heating.size else (0.0, 1.0, 0.0, 0.0)
             self._numbers(heat_gain=gain, heat_tau=tau, heat_origin=origin, heat_most=most)
         if has.surroundings:
             self._surroundings()
-        if has.gain:
-            self._numbers(gain_origin=laws.gain[0], gain_factor=laws.gain[1])
+        self._numbers(gain_origin=laws.gain[0], gain_factor=laws.gain[1])
 
     def _surroundings(self) -> None:
         """Add the quantities that the axis follows, with their numbers."""
@@ -231,13 +205,9 @@ class _Tables:
         for one in followed:
             values = (one.reference, one.offset_gain, one.sensitivity_gain, one.time_constant, one.averaging, one.ahead)
             rows.append(f"    {{{self._quantities[one.key]}, {', '.join(map(number, values))}}},")
-        if rows:
-            name = f"{self._prefix}_quantity"
-            self.tables.append("\n".join([f"static const slpi_quantity_law_t {name}[] = {{", *rows, "};"]))
-        self.fields |= {
-            "quantities": str(len(rows)),
-            "quantity": f"{self._prefix}_quantity" if rows else "NULL",
-        }
+        start = f"static const slpi_quantity_law_t {self._prefix}_quantity[] = {{"
+        self._counts(quantities=len(rows))
+        self._refer("const slpi_quantity_law_t *quantity", "quantity", "\n".join([start, *rows, "};"]) if rows else "")
         self._numbers(surroundings_origin=effect.origin if effect else 0.0)
 
 
@@ -264,21 +234,21 @@ def comment(text: str) -> str:
 
 def context_of(stage: ExportedStage) -> Mapping[str, Any]:
     """Return what the templates are filled with."""
-    has, laws = Features.of(stage), [axis.laws for axis in stage.axes]
+    has, laws = _features(stage), [axis.laws for axis in stage.axes]
     axes, numbers = [], {one.key: k for k, one in enumerate(stage.quantities)}
     for place, axis in enumerate(stage.axes):
         made = _Tables(axis, place, has, numbers)
         delay = axis.model.chain.delay
         axes.append({
             "name": comment(axis.name), "ahead": repr(delay) if delay else "", "tables": made.tables,
-            "fields": list(made.fields.items()),
+            "fields": made.fields,
         })  # fmt: skip
     operators = max(axis.branches.operators.shape[1] if axis.branches.operators.ndim == 2 else 0 for axis in stage.axes)
     conditions = ["a->lag > R(0.0)"] * has.lag + ["a->amplifier_slew < SLPI_NONE"] * has.slew
     lines = [f"model of {stage.model.created or 'unknown time'}, hardware '{stage.model.hardware_id}'"]
     lines += [line for axis in stage.axes for line in axis.describe]
     return {
-        "has": {field.name: getattr(has, field.name) for field in fields(has)},
+        "has": has,
         "axes": axes,
         "about": [comment(line) for line in lines],
         "stack_bound": _stack_bound(stage),
@@ -289,11 +259,10 @@ def context_of(stage: ExportedStage) -> Mapping[str, Any]:
         "end": repr(END),
         "damping": repr(DAMPING),
         "widest": repr(WIDEST),
-        "before_condition": " || ".join(conditions),
+        "before_condition": " || ".join(conditions) or "0",
         "most": {
             "relaxations": max(one.relaxations.shape[1] for one in laws),
             "modes": max(len(one.modes) for one in laws),
-            "factors": max(len(one.factors) for one in laws),
             "operators": operators,
             "knots": 4 * operators + 2,
             "quantities": max(len(axis.surroundings.quantities) if axis.surroundings else 0 for axis in stage.axes),
@@ -315,14 +284,14 @@ def _feedback(loops: Sequence[ExportedLoop]) -> dict[str, Any] | None:
     """Return what the templates say of the feedback; None without one."""
     if not loops:
         return None
-    rows, laws = list[FloatArray](), []
+    rows, laws = list[Section](), []
     for loop in loops:
         own, gains = loop.sections, loop.gains
         values = (gains.proportional, gains.integral, gains.derivative, loop.moved, loop.most)
         laws.append(f"{{{len(rows)}, {len(own)}, {', '.join(map(number, values))}}}")
-        rows += [np.array([one.b0, one.b1, one.b2, one.a1, one.a2]) for one in own]
+        rows += own
     return {
-        "rows": ["{" + ", ".join(map(number, row)) + "}" for row in rows or [np.zeros(5)]],
+        "rows": ["{" + ", ".join(map(number, row)) + "}" for row in rows or [Section(0.0, 0.0, 0.0, 0.0, 0.0)]],
         "laws": laws,
         "period": repr(loops[0].period),
         "released": repr(loops[0].released),

@@ -19,6 +19,7 @@ from slpi_ros.model.limits import MAX_DT
 VERSIONS = ("3.0", "2.0")
 # Names of the folder of the binary, by version, and the time that every file in a unit has.
 PLATFORM, EPOCH = {"3.0": "x86_64-linux", "2.0": "linux64"}, (2000, 1, 1, 0, 0, 0)
+FLAGS = ("-std=c11", "-O2", "-shared", "-fPIC", "-fvisibility=hidden")
 # Usual step of a simulation (s), and the longest of an inverse with a slew limit, which takes it in parts of MAX_DT.
 STEP, LONGEST_STEP = 1e-4, 1000.0
 # Says, as the last bytes of the archive, who wrote it.
@@ -65,49 +66,27 @@ def fmu(stage: ExportedStage, unit: Unit, version: str) -> bytes:
     starts = list(map(repr, unit.starts(stage)))
     names = [axis.name for axis in stage.axes]
     told = comment("; ".join(line.strip() for axis in stage.axes for line in axis.describe))
-    sources, places = c_files(stage), range(1, len(names) + 1)
+    sources = c_files(stage)
     token = hashlib.sha256(f"{unit}{version}{sources}".encode()).hexdigest()[:32]
     (name_in, unit_in), (name_out, unit_out) = unit.given, unit.answered
-    inputs = [
-        {"name": f"{name_in}_{name}", "reference": k, "causality": "input", "unit": unit_in, "start": start}
-        for name, k, start in zip(names, places, starts, strict=True)
-    ]
-    outputs = [
-        {
-            "name": f"{name_out}_{name}",
-            "reference": k + len(names),
-            "causality": "output",
-            "unit": unit_out,
-            "start": "",
-        }
-        for name, k in zip(names, places, strict=True)
-    ]
-    quantities = [
-        {
-            "name": f"surrounding_{one.key}",
-            "reference": k + 2 * len(names),
-            "causality": "input",
-            "unit": "",
-            "start": repr(one.reference),
-        }
-        for k, one in enumerate(stage.quantities, 1)
-    ]
     # Only the inverse has feedback.
-    loops = stage.loops if unit.given[0] == "desired" else ()
-    measured = [
-        {"name": f"measured_{name}", "reference": 0, "causality": "input", "unit": "m", "start": start}
-        for name, start in zip(names, starts, strict=True)
-        if loops
+    loops = stage.loops if name_in == "desired" else ()
+    inputs = list(zip(names, starts, strict=True))
+    rows = [(f"{name_in}_{name}", "input", unit_in, start) for name, start in inputs]
+    rows += [(f"{name_out}_{name}", "output", unit_out, "") for name in names]
+    rows += [(f"surrounding_{one.key}", "input", "", repr(one.reference)) for one in stage.quantities]
+    rows += [(f"measured_{name}", "input", "m", start) for name, start in inputs if loops]
+    variables = [
+        {"name": name, "reference": k, "causality": causality, "unit": its_unit, "start": start}
+        for k, (name, causality, its_unit, start) in enumerate(rows, 1)
     ]
-    for k, each in enumerate(measured, 1 + 2 * len(names) + len(quantities)):
-        each["reference"] = k
     context: dict[str, Any] = {
         "limits": [(repr(axis.allowed.lower), repr(axis.allowed.upper)) for axis in stage.axes] if loops else [],
-        "quantities": quantities, "limited": unit.limited(stage), "longest": repr(MAX_DT), "most": repr(LONGEST_STEP),
-        "version": version, "what": unit.what, "file": file, "token": f"{{{token}}}", "starts": starts,
+        "quantities": stage.quantities, "limited": unit.limited(stage), "longest": repr(MAX_DT),
+        "most": repr(LONGEST_STEP),
+        "version": version, "what": unit.what, "file": file, "token": f"{{{token}}}", "variables": variables,
         "function": unit.function, "identifier": unit.identifier,
         "step": repr(loops[0].period if loops else STEP),
-        "variables": [*inputs, *outputs, *quantities, *measured],
         "description": f"{unit.what} of a piezo stage: {told}",
     }  # fmt: skip
     sources[file] = _filled("slpi_fmu.c", context)
@@ -135,18 +114,7 @@ def compiled(sources: dict[str, str]) -> bytes:
         for name, text in sources.items():
             (folder / name).write_text(text, encoding="utf-8")
         files = [name for name in sources if name.endswith(".c")]
-        command = [
-            compiler,
-            "-std=c11",
-            "-O2",
-            "-shared",
-            "-fPIC",
-            "-fvisibility=hidden",
-            *files,
-            "-o",
-            "unit.so",
-            "-lm",
-        ]
+        command = [compiler, *FLAGS, *files, "-o", "unit.so", "-lm"]
         done = subprocess.run(command, cwd=folder, capture_output=True, text=True)
         if done.returncode:
             said = (done.stderr.splitlines() or ["it ended without a word"])[0]

@@ -10,7 +10,7 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.compensator.gains_file import TunedGains
-from slpi_ros.effects.base import Followed
+from slpi_ros.effects.base import Effect, Followed
 from slpi_ros.effects.filters import SPACING
 from slpi_ros.effects.paths import Laws
 from slpi_ros.effects.surroundings import Surroundings
@@ -76,7 +76,7 @@ class ExportedAxis:
                 "identify kind 'slpi'"
             )
         chain, refused = self.model.chain, list[str]()
-        for effect in (*chain.before, *([chain.around] if chain.around else []), *chain.own):
+        for effect in self._inside:
             if effect.streaming() is None:
                 # It is a delay, which only future setpoints undo, or part of the limits.
                 known = bool(effect.shift) or effect.passes != (-inf, inf) or effect.acts_on == "voltage"
@@ -88,11 +88,17 @@ class ExportedAxis:
         if refused:
             raise UsageError(f"axis '{self.name}': effect '{refused[0]}' cannot be exported; leave it out of the model")
 
+    @property
+    def _inside(self) -> tuple[Effect, ...]:
+        """Effects of the axis itself."""
+        chain = self.model.chain
+        return (*chain.before, *([chain.around] if chain.around else []), *chain.own)
+
     @cached_property
     def laws(self) -> Laws:
         """Parameters of the effects."""
-        chain, found = self.model.chain, dict[str, Any]()
-        for effect in (*chain.before, *([chain.around] if chain.around else []), *chain.own):
+        found = dict[str, Any]()
+        for effect in self._inside:
             if effect.streaming() is not None:
                 found |= effect.laws() or {}
         return Laws(**found)
@@ -165,8 +171,7 @@ class ExportedAxis:
     @property
     def inverted(self) -> list[str]:
         """Names of the effects that the inverse compensates."""
-        chain = self.model.chain
-        inside = (*chain.before, *([chain.around] if chain.around else []), *chain.own, *chain.shared)
+        inside = (*self._inside, *self.model.chain.shared)
         return [effect.name for effect in inside if not effect.shift]
 
     @property

@@ -1,12 +1,11 @@
 """What an export can be written as: its files, and whether they may be written into a folder."""
 
-import os
 import shlex
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.errors import UsageError
 from slpi_ros.export.c_source import c_files
 from slpi_ros.export.fmu import MARK, NAMES, fmu_files
 from slpi_ros.export.stage import ExportedStage
@@ -38,11 +37,8 @@ class Target:
         made = self.files(stage)
         with output_folder(folder, *made) as place:
             for name, content in made.items():
-                if isinstance(content, bytes):
-                    _write_bytes(place / name, content)
-                else:
-                    with all_or_nothing(place / name) as file:
-                        file.write(content)
+                with all_or_nothing(place / name) as file:
+                    file.buffer.write(content if isinstance(content, bytes) else content.encode())
         return list(made)
 
     def next(self, folder: str) -> str:
@@ -59,18 +55,6 @@ def _own(path: Path) -> bool:
         return not content or MARK in content[:ENDS] + content[-ENDS:]
     except OSError:
         return False
-
-
-def _write_bytes(path: Path, content: bytes) -> None:
-    """Replace a file at once."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}.partial")
-    try:
-        draft.write_bytes(content)
-        os.replace(draft, path)
-    except OSError as error:
-        raise SlpiError(f"{path}: cannot be written: {error.strerror}; choose another place") from None
-    finally:
-        draft.unlink(missing_ok=True)
 
 
 def _c(stage: ExportedStage) -> Mapping[str, str]:

@@ -21,7 +21,7 @@ from slpi_ros.io.atomic_file import make_folder
 from slpi_ros.io.bag_writer import BagWriter
 from slpi_ros.io.desired import read_path
 from slpi_ros.io.messages import JointStateEncoder
-from slpi_ros.io.stage_name import acceptance, same_stage
+from slpi_ros.io.stage_name import same_stage
 from slpi_ros.io.unfinished_bags import partial_path
 from slpi_ros.model.limits import volts
 from slpi_ros.nodes import parameters as declare
@@ -214,8 +214,6 @@ class Calibrator(Node):
         self._output, self._patience = Path(values["output"]).absolute(), values["patience"]
         _prepare(self._output, resume=values["resume"])
         self._kept_stage = stage_of_kept(self._output)
-        if accepted := values["accept_stage"]:
-            self.get_logger().warning(acceptance(accepted, "accept_stage"))
         self._guard = GuardedDrive(self, values, on_state=self._on_state)
         self._job: _Job | None = None
         self._worker: CalibrationJob | None = None

@@ -4,7 +4,7 @@ import ctypes
 import importlib
 import os
 import sys
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
@@ -53,12 +53,16 @@ def nanoseconds(time: Any) -> int:
     return int(time.sec * SECOND_NS + time.nanosec)
 
 
+def read_state(data: bytes) -> Any:
+    """Return a serialized JointState; None if it is not valid."""
+    with suppress(RuntimeError):
+        return deserialize_message(data, JointState)
+    return None
+
+
 def as_rclpy_reads(data: bytes) -> tuple[int, Sequence[str], Sequence[float]]:
     """Return stamp (ns), names and positions of a serialized JointState; no names if it is not valid."""
-    try:
-        message = deserialize_message(data, JointState)
-    except RuntimeError:
-        return 0, (), ()
+    message = read_state(data) or JointState()
     return nanoseconds(message.header.stamp), message.name, message.position
 
 
@@ -142,6 +146,16 @@ def steady_timer(node: Node, period: float, callback: Callable[[], None]) -> Tim
     return node.create_timer(period, lambda: callback(), clock=Clock(clock_type=ClockType.STEADY_TIME))
 
 
+def queued(subscription: Any, most: int) -> Iterator[Any]:
+    """Yield the messages that wait for a subscription, at most so many."""
+    for _ in range(most):
+        with subscription.handle:
+            taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
+        if taken is None:
+            return
+        yield taken[0]
+
+
 def reliability_of(publishers: Sequence[Any]) -> ReliabilityPolicy:
     """Return the reliability that all publishers of a topic offer."""
     reliable = all(each.qos_profile.reliability == ReliabilityPolicy.RELIABLE for each in publishers)
@@ -173,9 +187,9 @@ def publishers_beside(node: Node, topic: str) -> list[str]:
 
 
 def ask_for_priority(node: Node, priority: int) -> None:
-    """Run all threads of this process under SCHED_FIFO, including DDS; log a warning if not permitted."""
+    """Run all threads of this process under SCHED_FIFO, including DDS; log a warning if not permitted. 0: normally."""
     try:
-        for thread in Path("/proc/self/task").iterdir():
+        for thread in Path("/proc/self/task").iterdir() if priority else ():
             os.sched_setscheduler(int(thread.name), os.SCHED_FIFO, os.sched_param(priority))
     except (OSError, AttributeError) as error:
         node.get_logger().warning(f"no realtime_priority {priority}: {error}; using normal scheduling")

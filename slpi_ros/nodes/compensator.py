@@ -9,7 +9,6 @@ from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.event_handler import SubscriptionEventCallbacks, UnsupportedEventTypeError
 from rclpy.lifecycle import LifecycleNode, LifecycleState, TransitionCallbackReturn
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64, Float64MultiArray, String
 from trajectory_msgs.msg import JointTrajectory
@@ -21,7 +20,6 @@ from slpi_ros.compensator.ownership import AUTO
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS, JointStates
-from slpi_ros.io.stage_name import acceptance
 from slpi_ros.model.document import load_model
 from slpi_ros.model.limits import volts
 from slpi_ros.nodes.common import (
@@ -31,6 +29,8 @@ from slpi_ros.nodes.common import (
     as_rclpy_reads,
     ask_for_priority,
     keep_freed_memory,
+    queued,
+    read_state,
     refuse_impossible_transitions,
     serve,
     steady_timer,
@@ -108,10 +108,7 @@ class Compensator(LifecycleNode):
         # A simulated clock may stop while the amplifier moves in real time.
         steady_timer(self, values["diagnostic_period"], self._on_period)
         steady_timer(self, WATCH_PERIOD, self._watch)
-        if accepted := values["accept_stage"]:
-            self.get_logger().warning(acceptance(accepted, "accept_stage"))
-        if values["realtime_priority"]:
-            ask_for_priority(self, values["realtime_priority"])
+        ask_for_priority(self, values["realtime_priority"])
         if values["autostart"]:
             # A model that is refused ends the process.
             self._models.load(values["model_file"])
@@ -308,12 +305,8 @@ class Compensator(LifecycleNode):
     def _work_off(self) -> None:
         """Answer the desired messages that wait: after a stall the executor takes one for each that comes, no more."""
         subscription, counts, count = self._inputs[0], self._controller.counts, 0
-        while count < BACKLOG:
-            with subscription.handle:
-                taken = subscription.handle.take_message(subscription.msg_type, subscription.raw)
-            if taken is None:
-                break
-            subscription.callback(taken[0])
+        for message in queued(subscription, BACKLOG):
+            subscription.callback(message)
             count += 1
         counts["worked_off"] += count
         counts["largest_backlog"] = max(counts["largest_backlog"], count)
@@ -331,9 +324,7 @@ class Compensator(LifecycleNode):
         if controller.ownership.started and now_ns - self._reported_ns < REPORT_NS:
             return
         self._reported_ns = now_ns
-        try:
-            state = deserialize_message(data, JointState)
-        except RuntimeError:
+        if (state := read_state(data)) is None:
             return
         self._company.heard(now_ns)
         if controller.report(state.name, state.effort, now_ns, state.header.frame_id):

@@ -183,8 +183,7 @@ class Driver(Node):
         self._other, self._listening = OtherDriver(self, "stage_state", values["axes"]), True
         steady_timer(self, LOOK_PERIOD, self._look)
         self._thread = threading.Thread(target=self._run, name=device.name, daemon=True)
-        if values["realtime_priority"]:
-            ask_for_priority(self, values["realtime_priority"])
+        ask_for_priority(self, values["realtime_priority"])
 
     def destroy_node(self) -> None:
         """Let the thread of the device end, after the ramp to rest if there is one; then destroy the node."""

@@ -115,12 +115,17 @@ class NodeCalls:
         return answer.result()
 
     def _wait(self, seconds: float, done: Callable[[], bool]) -> bool:
-        end = time.monotonic() + seconds
-        while not done():
-            if time.monotonic() > end:
-                return False
-            self._executor.spin_once(timeout_sec=SPIN)
-        return True
+        return spun(self._executor, seconds, done)
+
+
+def spun(executor: SingleThreadedExecutor, seconds: float, done: Callable[[], bool] = lambda: False) -> bool:
+    """Spin for some `seconds` at most, until it is `done`; return whether it is."""
+    end = time.monotonic() + seconds
+    while not done():
+        if time.monotonic() > end:
+            return False
+        executor.spin_once(timeout_sec=SPIN)
+    return True
 
 
 def value_of(text: str, kind: int, name: str) -> Any:

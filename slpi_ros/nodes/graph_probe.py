@@ -1,7 +1,6 @@
 """What ``slpi doctor`` asks a running ROS graph."""
 
 import math
-import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
 from typing import Any
@@ -19,14 +18,13 @@ from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import SlpiError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.document import parse_model
-from slpi_ros.nodes.common import LATCHED, full_name, reliability_of
-from slpi_ros.nodes.graph_calls import joined
+from slpi_ros.nodes.common import LATCHED, full_name, nanoseconds, reliability_of
+from slpi_ros.nodes.graph_calls import joined, spun
 from slpi_ros.nodes.parameters import numbers
 from slpi_ros.reports.doctor import STATE_TYPE, Graph
 
 # Longest time for discovery, and for a node to answer a question about its parameters, seconds.
 DISCOVERY, ANSWER = 3.0, 2.0
-SPIN = 0.02
 ASKED = ("axes", "voltage_min", "voltage_max")
 DEPTH = 1000
 
@@ -41,23 +39,22 @@ class _Probe:
     def __init__(self, node: Node, executor: SingleThreadedExecutor, state_topic: str, command_topic: str) -> None:
         self._node, self._executor = node, executor
         self._state, self._command = (node.resolve_topic_name(topic) for topic in (state_topic, command_topic))
-        self._times: list[tuple[float, float]] = []
-        self._last: JointState | None = None
-        self._states: list[JointState] = []
+        self._states: list[tuple[float, JointState]] = []  # with the times of their arrival, s
         self._models: list[String] = []
 
     def watch(self, seconds: float) -> Graph:
         node = self._node
         node.create_subscription(String, "stage_model", self._models.append, LATCHED)
-        self._spin(DISCOVERY, lambda: bool(node.get_publishers_info_by_topic(self._state)))
+        spun(self._executor, DISCOVERY, lambda: bool(node.get_publishers_info_by_topic(self._state)))
         offers = node.get_publishers_info_by_topic(self._state)
         if offers and all(offer.topic_type == STATE_TYPE for offer in offers):
             qos = QoSProfile(depth=DEPTH, reliability=reliability_of(offers))
             node.create_subscription(JointState, self._state, self._on_state, qos)
-        self._spin(seconds)
+        spun(self._executor, seconds)
         commanding = _ends(node.get_publishers_info_by_topic(self._command))
-        last = self._last or JointState()
-        stamps, arrivals = np.array(self._times).reshape(-1, 2).T
+        last = self._states[-1][1] if self._states else JointState()
+        times = [(nanoseconds(state.header.stamp) / SECOND_NS, arrival) for arrival, state in self._states]
+        stamps, arrivals = np.array(times).reshape(-1, 2).T
         own = node.get_fully_qualified_name()
         names = [(name, space) for name, space in node.get_node_names_and_namespaces() if not name.startswith("_")]
         model = None
@@ -85,33 +82,25 @@ class _Probe:
         )
 
     def _on_state(self, state: JointState) -> None:
-        stamp = state.header.stamp
-        self._times.append((stamp.sec + stamp.nanosec * 1e-9, self._node.get_clock().now().nanoseconds / SECOND_NS))
-        self._last = state
-        self._states.append(state)
+        self._states.append((self._node.get_clock().now().nanoseconds / SECOND_NS, state))
 
     def _readings(self, axis: str) -> tuple[FloatArray, FloatArray]:
         """Return the voltages (V) and displacements (m) of an axis in all states, (N,)."""
         rows = []
-        for state in self._states:
+        for _, state in self._states:
             v, y = (dict(zip(state.name, values, strict=False)) for values in (state.effort, state.position))
             rows.append((v.get(axis, math.nan), y.get(axis, math.nan)))
         voltage, displacement = np.array(rows).T
         return voltage, displacement
 
-    def _spin(self, seconds: float, done: Any = lambda: False) -> None:
-        end = time.monotonic() + seconds
-        while time.monotonic() < end and not done():
-            self._executor.spin_once(timeout_sec=SPIN)
-
     def _limits(self, name: str) -> Mapping[str, tuple[float, float]]:
         """Return the voltage limits (V) of the axes of a node; empty if it does not tell."""
         client = self._node.create_client(GetParameters, f"{name}/get_parameters")
-        self._spin(ANSWER, client.service_is_ready)
+        spun(self._executor, ANSWER, client.service_is_ready)
         if not client.service_is_ready():
             return {}
         answer = client.call_async(GetParameters.Request(names=list(ASKED)))
-        self._spin(ANSWER, answer.done)
+        spun(self._executor, ANSWER, answer.done)
         values = [parameter_value_to_python(value) for value in answer.result().values] if answer.done() else []
         if len(values) < len(ASKED) or None in values:
             return {}

@@ -9,7 +9,6 @@ from typing import Any
 from rclpy.duration import Duration
 from rclpy.node import Node
 from rclpy.qos import QoSProfile
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
 
@@ -20,7 +19,7 @@ from slpi_ros.compensator.monitor import Monitor
 from slpi_ros.compensator.reporters import SoleReporter
 from slpi_ros.errors import RecordError
 from slpi_ros.model.limits import StageLimiter
-from slpi_ros.nodes.common import COMMANDS, nanoseconds, publishers_beside, reliability_of
+from slpi_ros.nodes.common import COMMANDS, nanoseconds, publishers_beside, read_state, reliability_of
 from slpi_ros.nodes.company import COMMAND, LEFT_NS, STATE, StateProbe
 from slpi_ros.nodes.parameters import Values, limits_of
 
@@ -226,9 +225,7 @@ class GuardedDrive:
         return (self.reports(rest) and now - max(since, self._away) >= lasts) or now - since >= patience
 
     def _on_state(self, data: bytes) -> None:
-        try:
-            state = deserialize_message(data, JointState)
-        except RuntimeError:
+        if (state := read_state(data)) is None:
             return
         volts, metres = (dict(zip(state.name, values, strict=False)) for values in (state.effort, state.position))
         v, y = ([float(values.get(axis, math.nan)) for axis in self._axes] for values in (volts, metres))

@@ -2,17 +2,15 @@
 
 import time
 from collections.abc import Sequence
-from contextlib import suppress
 
 from rclpy.node import Node
 from rclpy.qos import QoSProfile, ReliabilityPolicy
-from rclpy.serialization import deserialize_message
 from sensor_msgs.msg import JointState
 
 from slpi_ros.compensator.listening import LOOK_WITHOUT_NS, QUIET_NS
 from slpi_ros.errors import RecordError, shown
 from slpi_ros.io.stage_name import same_stage, stage_name
-from slpi_ros.nodes.common import UNNAMED, publishers_beside
+from slpi_ros.nodes.common import UNNAMED, publishers_beside, read_state
 
 # Time to find publishers, as middleware announces itself every 3 s where what it said at first is lost, and to hear one
 # that was found: one that was killed is known for 20 s more, and silent.
@@ -59,7 +57,5 @@ class OtherDriver:
         )
 
     def _on_state(self, data: bytes) -> None:
-        with suppress(RuntimeError):
-            state = deserialize_message(data, JointState)
-            if self._axes.intersection(state.name):
-                self.frames.add(state.header.frame_id)
+        if (state := read_state(data)) and self._axes.intersection(state.name):
+            self.frames.add(state.header.frame_id)

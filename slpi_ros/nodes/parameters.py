@@ -14,6 +14,7 @@ from rclpy.parameter import Parameter
 
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.excitation.drives import slew_limits
+from slpi_ros.io.stage_name import acceptance
 from slpi_ros.model.limits import Limits
 from slpi_ros.nodes.parameter_texts import leading_zeros, overridden
 
@@ -211,7 +212,9 @@ class Parameters(Generic[Settings]):
                 self._values[name] = entry.expanded(given.value)
         self.settings = make(self._values)
         self._tell_unknown(node)
-        for remark in (*leading_zeros(sys.argv), *overridden(sys.argv, node)):
+        accepted = self._values.get("accept_stage")
+        remarks = [acceptance(accepted, "accept_stage")] if accepted else []
+        for remark in (*leading_zeros(sys.argv), *overridden(sys.argv, node), *remarks):
             node.get_logger().warning(remark)
 
     def _tell_unknown(self, node: Node) -> None:

@@ -12,7 +12,7 @@ from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.io.bag_writer import STORAGES, BagWriter
 from slpi_ros.io.messages import JOINT_STATE
 from slpi_ros.nodes import parameters as declare
-from slpi_ros.nodes.common import message_class, reliability_of, request_stop, steady_timer
+from slpi_ros.nodes.common import message_class, queued, reliability_of, request_stop, steady_timer
 from slpi_ros.nodes.parameters import Declaration, Parameters, validated
 
 # Queue length for bursts during slow disk writes.
@@ -162,14 +162,9 @@ class Recorder(Node):
 
     def _drain(self, name: str) -> None:
         """Record the messages of a topic that are still queued in the middleware."""
-        subscription = self._listening[name]
-        with subscription.handle:
-            # Limited, so that continuous publishing cannot delay the end.
-            for _ in range(DEPTH):
-                taken = subscription.handle.take_message(subscription.msg_type, True)
-                if taken is None:
-                    break
-                self._record(name, taken[0])
+        # Limited, so that continuous publishing cannot delay the end.
+        for message in queued(self._listening[name], DEPTH):
+            self._record(name, message)
 
     def _finish(self, bag: BagWriter) -> None:
         """Close the bag and move it to its final path; RecordError if it is empty."""

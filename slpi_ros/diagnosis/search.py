@@ -204,21 +204,24 @@ class Library:
             solution = np.linalg.lstsq(scaled, np.column_stack([beside, vector[chosen] / size]), rcond=RIDGE)[0]
             vector = vector - beside.T @ solution[:, -1]
             whole = whole - beside.T @ solution[:, :-1]
-        best: dict[tuple[str, int, int], tuple[float, Form]] = {}
-        names = {form.name for form in taken}
+        size = np.sqrt(np.maximum(np.diag(self.held_out.whole), 1e-300))
+        left_out = {*once, *(form.name for form in taken)}
+        gains: dict[Form, float] = {}
+        # Many small systems, those of one size at once.
+        of_size: dict[int, list[Form]] = {}
         for form in self.forms:
-            if form.name in once or form.name in names:
-                continue
-            places = list(form.places)
-            own, wanted = whole[np.ix_(places, places)], vector[places]
-            size = np.sqrt(np.maximum(np.diag(self.held_out.whole)[places], 1e-300))
-            gain = float(
-                wanted / size @ np.linalg.solve(own / np.outer(size, size) + 1e-6 * np.eye(len(places)), wanted / size)
-            )
-            key = *form.kind, form.numbers
-            if key not in best or gain > best[key][0]:
-                best[key] = gain, form
-        return [form for _, form in sorted(best.values(), key=lambda pair: -pair[0])]
+            if form.name not in left_out:
+                of_size.setdefault(form.numbers, []).append(form)
+        for numbers, forms in of_size.items():
+            at = np.array([form.first for form in forms])[:, None] + np.arange(numbers)
+            own = whole[at[:, :, None], at[:, None, :]] / (size[at][:, :, None] * size[at][:, None, :])
+            wanted = vector[at] / size[at]
+            solution = np.linalg.solve(own + 1e-6 * np.eye(numbers), wanted[:, :, None])[:, :, 0]
+            gains.update(zip(forms, np.sum(wanted * solution, axis=1).tolist(), strict=True))
+        best: dict[tuple[str, int, int], Form] = {}
+        for form in sorted(gains, key=lambda form: -gains[form]):
+            best.setdefault((*form.kind, form.numbers), form)
+        return [*best.values()]
 
     def choices(self, fixed: Collection[str], screened: int = 12) -> list[Choice]:
         """Return sets in reach: forms added, to all effects and to all but one, the least error first."""

@@ -2,7 +2,6 @@
 # The journal ``journal.jsonl`` is appended to, one line per finished step, and each line is complete or dropped when it
 # is read again. So a run that was killed at any moment is continued from what it had finished.
 
-import fcntl
 import json
 import os
 import time
@@ -14,6 +13,7 @@ from typing import TYPE_CHECKING, Any, Self
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.fleet.bags import Examined, Judged, Row
 from slpi_ros.io.atomic_file import is_replaceable, make_folder
+from slpi_ros.io.file_lock import lock
 
 if TYPE_CHECKING:
     import pyarrow as pa
@@ -48,14 +48,10 @@ class Results:
         self._lock = os.open(self.folder / LOCK, os.O_RDWR | os.O_CREAT, 0o644)
         self._file, self._synced = -1, 0.0
         try:
-            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            if not lock(self._lock):
+                raise SlpiError(f"{folder}: another run writes into this folder; wait for its end, or name another")
             self._file = os.open(self.folder / JOURNAL, os.O_RDWR | os.O_CREAT | os.O_APPEND, 0o644)
             self._read({"schema": SCHEMA, **options})
-        except BlockingIOError:
-            self.close()
-            raise SlpiError(
-                f"{folder}: another run writes into this folder; wait for its end, or name another"
-            ) from None
         except BaseException:
             self.close()
             raise

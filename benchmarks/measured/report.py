@@ -25,7 +25,7 @@ PAGE, FIGURES = (ROOT / "docs" / "explanation" / name for name in ("measured.md"
 # Section of the kept figures of ``make bench-latency``.
 LATENCY = "latency"
 # The kept rows of simulated stages in README; the others stand on the page of figures.
-IN_README = ("accuracy", "calibrator", "confusion pair", "learning")
+IN_README = ("accuracy", "promise", "confusion pair", "learning")
 # Methods whose figures stand in README. The best of all others has a column of its own.
 COLUMNS = ("PI", "PI, lag", "SLPI", "SLPI, causes")
 Rows = Mapping[str, Mapping[str, Mapping[str, Any]]]

@@ -192,7 +192,7 @@ def main() -> None:
         what = (
             f"calibrator, {options.stages} simulated stages with one or two hidden effects: stages with all causes "
             "found; mean error that it promises, of stroke, median; stages on which scans five minutes later, after a "
-            f"reset and after a restart, have it within a factor of {FACTOR:g}; others of which it was told that the "
+            f"reset and after a restart, have it within a factor of {FACTOR:g}; others of which it said that the "
             "zero or the sensitivity goes on moving"
         )
         said = f"{right}; {100.0 * error:.3f} %; {good}; {told}"

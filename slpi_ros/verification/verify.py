@@ -403,7 +403,7 @@ def _free_run(
             warnings.simplefilter("ignore", UnidentifiedLoopWarning)
             runs[name] = _run(axis, t, samples, start_memory, -np.inf if span[0] is None else span[0])
             start = runs[name].found.start
-            own = replace(axis, start=start).uncoupled_displacement(t, samples.v)
+            own = replace(runs[name].found.axis, start=start).uncoupled_displacement(t, samples.v)
         motions[name] = t, own - start.displacement
     coupled = {}
     for name in names:

@@ -9,26 +9,57 @@ import os
 import re
 import sys
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from importlib import import_module
 from io import TextIOWrapper
-from keyword import iskeyword
-from typing import Any, NoReturn
+from typing import Any, NoReturn, Protocol
 
-from slpi_ros.cli.command import MOST_LINES, say
+from slpi_ros.cli import (
+    calibrate,
+    call,
+    compensate,
+    diagnose,
+    doctor,
+    excite,
+    experiments,
+    export,
+    fleet,
+    identify,
+    import_,
+    learn,
+    param,
+    refit,
+    show,
+    simulate,
+    tune,
+    verify,
+)
+from slpi_ros.cli.command import MOST_LINES, Result, say
 from slpi_ros.errors import DependencyError, SlpiError, dependencies_needed, shown
 from slpi_ros.identification.progress import report_progress, shown_on
 
 __all__ = ["COMMANDS", "MOST_LINES", "main", "parser"]
 
-# In the order of ``slpi --help``: each is a module with `HELP`, `EXAMPLE`, `add_options` and `run`. What loads slowly
-# (the numerical and plotting modules) is imported when it runs.
-_NAMES = (
-    "import", "identify", "diagnose", "verify", "excite", "refit", "fleet", "simulate", "compensate", "learn", "export",
-    "tune", "doctor", "call", "param", "calibrate", "experiments", "show",
-)  # fmt: skip
-COMMANDS = {name: import_module(f"slpi_ros.cli.{name}{'_' * iskeyword(name)}") for name in _NAMES}
+
+class Command(Protocol):
+    """A module with one command. What loads slowly (the numerical and plotting modules) is imported by its `run`."""
+
+    HELP: str
+    EXAMPLE: str
+
+    def add_options(self, command: argparse.ArgumentParser, /) -> None:
+        """Add the options of the command."""
+
+    def run(self, options: argparse.Namespace, /) -> Result:
+        """Run the command."""
+
+
+# In the order of ``slpi --help``.
+COMMANDS: Mapping[str, Command] = {
+    "import": import_, "identify": identify, "diagnose": diagnose, "verify": verify, "excite": excite, "refit": refit,
+    "fleet": fleet, "simulate": simulate, "compensate": compensate, "learn": learn, "export": export, "tune": tune,
+    "doctor": doctor, "call": call, "param": param, "calibrate": calibrate, "experiments": experiments, "show": show,
+}  # fmt: skip
 
 
 class _ShowVersion(argparse.Action):

@@ -63,7 +63,8 @@ DECLARATIONS = declare.read_only(
     ),
     declare.scalar(
         "speed", 1.0,
-        "Stage seconds per second. Other than 1: the node publishes /clock at `rate`, for nodes with use_sim_time.",
+        "Stage seconds per second, at most. Other than 1: the node publishes /clock, each time 1/`rate` further or less, "
+        "for nodes with use_sim_time.",
         (0.01, 1000.0),
     ),
     declare.text(
@@ -117,8 +118,9 @@ class StageSimulator(Node):
         for axis, one in self._stage.axes.items():
             if values["character"] == DRAWN:
                 self.get_logger().info(f"axis {axis}: {one.character}")
-        self._speed, self._begun_ns = values["speed"], time.monotonic_ns()
-        self._origin_ns, self._latest_ns = self.get_clock().now().nanoseconds, 0
+        self._speed, self._period_ns = values["speed"], int(1e9 / values["rate"])
+        self._latest_ns, self._ticked_ns = self.get_clock().now().nanoseconds, time.monotonic_ns()
+        self._published_ns = self._latest_ns
         begun = self._now_ns() * 1e-9
         for v in (*history, rest):
             self._stage.step(begun - DAY, [v] * len(axes))
@@ -139,17 +141,23 @@ class StageSimulator(Node):
             RoomSensors(self, values, self._now_ns)
 
     def _now_ns(self) -> int:
-        """Return the time of the stage (ns), which never decreases, even if the clock of the node is set back."""
+        """Return the time of the stage (ns), which never decreases, even if the clock of the node is set back.
+
+        A clock that the node publishes goes no further than a period ahead of its latest message: on a busy computer
+        the stage slows down instead of losing samples.
+        """
         if self._speed == 1.0:
             now = self.get_clock().now().nanoseconds
         else:
-            now = self._origin_ns + int(self._speed * (time.monotonic_ns() - self._begun_ns))
+            ahead = int(self._speed * (time.monotonic_ns() - self._ticked_ns))
+            now = self._published_ns + min(ahead, self._period_ns)
         self._latest_ns = max(self._latest_ns, now)
         return self._latest_ns
 
     def _on_timer(self) -> None:
         if self._speed != 1.0:
-            self._clock_publisher.publish(ClockMsg(clock=_stamp(self._now_ns())))
+            self._published_ns, self._ticked_ns = self._now_ns(), time.monotonic_ns()
+            self._clock_publisher.publish(ClockMsg(clock=_stamp(self._published_ns)))
         quiet = time.monotonic() > self._commanded_at + QUIET or not self.count_publishers(self._commands.topic_name)
         if quiet or not self._answers:
             self._apply(self._state.effort)

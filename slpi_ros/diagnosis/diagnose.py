@@ -16,7 +16,7 @@ from slpi_ros.diagnosis.joint_fit import JointFit
 from slpi_ros.diagnosis.prepare import Evidence, Part, driven_alike, evidence_of
 from slpi_ros.diagnosis.result import CHANGED, AxisDiagnosis, Diagnosis, Given, RecordOutcome
 from slpi_ros.diagnosis.ruler import NO_WORSE, beats
-from slpi_ros.diagnosis.search import is_own, seen
+from slpi_ros.diagnosis.search import STEPS, is_own, seen
 from slpi_ros.diagnosis.structures import BIAS
 from slpi_ros.diagnosis.verdict import judged, signals_of
 from slpi_ros.effects.base import EffectContext
@@ -37,8 +37,6 @@ from slpi_ros.model.stage_model import StageModel
 # Kinds that are refitted together with the effects. Any other kind is reported as unsuitable if its error exceeds that
 # of the loop family by this factor.
 REFITTED, WRONG_KIND = ("slpi", "pi"), 1.5
-# Gauss-Newton steps of the selected effects with the hysteresis of the given model, which has more vertices.
-REFINED = 3
 # A stage has changed if a new fit leaves at most this multiple of what the model left of its own records, or at most
 # this share of what the model leaves: else something else than the hysteresis is the matter.
 AS_ONCE, LITTLE = 1.5, 0.2
@@ -282,7 +280,7 @@ def _answer(base: JointFit, of_family: Evidence | None) -> Answer:
     finest = of_family if of_family and BIAS in answer.structures else evidence
     # A smoothness that suits few vertices may leave many without any hold.
     finer = replace(answer.now.evidence, basis=finest.basis, smoothness=evidence.smoothness)
-    now = JointFit(finer, answer.now.effects).smoothed().refined(REFINED)
+    now = JointFit(finer, answer.now.effects).smoothed().refined(STEPS)
     as_good = now.held_out.rms <= NO_WORSE * answer.now.held_out.rms
     return replace(answer, base=base, now=now) if as_good else answer
 

@@ -63,8 +63,8 @@ DECLARATIONS = declare.read_only(
     ),
     declare.scalar(
         "speed", 1.0,
-        "Stage seconds per second, at most. Other than 1: the node publishes /clock, each time 1/`rate` further or less, "
-        "for nodes with use_sim_time.",
+        "Stage seconds per second, at most. Other than 1: the node publishes /clock, each time 1/`rate` further, for "
+        "nodes with use_sim_time.",
         (0.01, 1000.0),
     ),
     declare.text(
@@ -143,8 +143,8 @@ class StageSimulator(Node):
     def _now_ns(self) -> int:
         """Return the time of the stage (ns), which never decreases, even if the clock of the node is set back.
 
-        A clock that the node publishes goes no further than a period ahead of its latest message: on a busy computer
-        the stage slows down instead of losing samples.
+        A clock that the node publishes goes on by a period with each message, and no further between them: on a busy
+        computer the stage slows down instead of losing samples.
         """
         if self._speed == 1.0:
             now = self.get_clock().now().nanoseconds
@@ -156,7 +156,7 @@ class StageSimulator(Node):
 
     def _on_timer(self) -> None:
         if self._speed != 1.0:
-            self._published_ns, self._ticked_ns = self._now_ns(), time.monotonic_ns()
+            self._published_ns, self._ticked_ns = self._published_ns + self._period_ns, time.monotonic_ns()
             self._clock_publisher.publish(ClockMsg(clock=_stamp(self._published_ns)))
         quiet = time.monotonic() > self._commanded_at + QUIET or not self.count_publishers(self._commands.topic_name)
         if quiet or not self._answers:

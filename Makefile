@@ -42,12 +42,13 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test test-long test-jazzy test-newest test-kilted test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-twins bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-recorder bench-oscillation bench-tune bench-export bench-coverage bench-identification bench-diagnosis-speed test-export-arm bench-company FORCE
+.PHONY: help build test test-long test-properties test-jazzy test-newest test-kilted test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-twins bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-recorder bench-oscillation bench-tune bench-export bench-coverage bench-identification bench-diagnosis-speed test-export-arm bench-company FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
 	@echo 'make test       build, lint, types, docstrings, tests: ten minutes on two cores'
-	@echo 'make test-long  build, then the tests that take long, and properties with more examples'
+	@echo 'make test-long  build, then the tests that take long'
+	@echo 'make test-properties  build, then all properties, with four times the examples of make test'
 	@echo 'make test-jazzy    the versions of Ubuntu 24.04 with Python 3.12: the quick tests of make test that depend on them'
 	@echo 'make test-newest   the same tests with the newest versions of today, Python 3.13 if it is there; make test-minimum with'
 	@echo '                   the oldest allowed; make test-kilted with the newest and ROS 2 Kilted'
@@ -120,10 +121,12 @@ test: build
 	$(VENV) -m ruff format --check .
 	@$(VENV) -m mypy & types=$$!; ($(PYTEST) -m 'not long'); tests=$$?; wait $$types && exit $$tests
 
-# Also every property, with more examples than in `make test`.
-test-long: export SLPI_EXAMPLES = 50
 test-long: build
-	$(PYTEST) -m 'long or hypothesis'
+	$(PYTEST) -m long
+
+test-properties: export SLPI_EXAMPLES = 100
+test-properties: build
+	$(PYTEST) -m hypothesis
 
 # The tests of `make test` that take no more than ten seconds and whose outcome may depend on versions: not those of the
 # checkout itself, and of tests with nodes and devices one case each.

@@ -55,7 +55,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # Priority of a test with nodes.
 USUAL = os.getpriority(os.PRIO_PROCESS, 0)
-# No verdict depends on the clock. CI draws the same examples every time; `make test-long` draws more of them.
+# No verdict depends on the clock. CI draws the same examples every time; `make test-properties` draws more of them.
 CI = bool(os.environ.get("CI"))
 EXAMPLES = int(os.environ.get("SLPI_EXAMPLES", "25"))
 # The other environments differ in versions: of each test with nodes or devices they run the first quick case.

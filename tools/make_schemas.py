@@ -16,7 +16,7 @@ SCHEMAS = Path(__file__).resolve().parents[1] / "msg_schemas"
 UNITS = {"s": "Seconds", "V": "Volts", "m": "Metres", "Hz": "Hertz", "rad": "Radians"}
 WIDTH = 120
 # Characters of the name of a topic or field.
-LONGEST_NAME = 255
+LONGEST_TEXT = 255
 
 
 def model_schema(schema):
@@ -52,7 +52,7 @@ def _fields(kind):
     texts = {item.name: item for item in fields(kind) if "text" in item.metadata}
     required = [name for name, item in texts.items() if item.default is MISSING]
     named = {
-        name: {"type": "string", "maxLength": LONGEST_NAME, "description": _sentence(item.metadata["text"])}
+        name: {"type": "string", "maxLength": LONGEST_TEXT, "description": _sentence(item.metadata["text"])}
         for name, item in texts.items()
     }
     return {

@@ -7,6 +7,7 @@ from math import inf, nan
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays.latest_rows import LatestRows
 from slpi_ros.compensator.monitor import Finding, Lasting, Rule, Silence
 from slpi_ros.compensator.sensor_rule import BEND, FEWEST, KEPT, FollowingLimits, misfit, slopes
 from slpi_ros.io.messages import SECOND_NS
@@ -180,7 +181,7 @@ class RelationRule(Rule):
         self._axis, self._rule, self._known = axis, rule or RelationLimits(), _Known(limits)
         self._found: Finding | None = None  # the first
         # Time (s), reported voltage (V), displacement (m).
-        self._readings: deque[tuple[float, float, float]] = deque(maxlen=KEPT)
+        self._readings = LatestRows(KEPT, 3)
         # Last displacement (m), how often it came, and the lowest and highest voltage (V) since.
         self._same: tuple[float, int, float, float] = (nan, 0, 0.0, 0.0)
         self._outside, self._misfit = Lasting(STATES), Lasting()
@@ -205,9 +206,8 @@ class RelationRule(Rule):
         """Take a displacement (m), and the voltage (V) that is reported with it."""
         v, y, readings = expected, reading, self._readings
         now = now_ns * 1e-9
-        readings.append((now, v, y))
-        while len(readings) > FEWEST and now - readings[0][0] > READINGS_TIME:
-            readings.popleft()
+        readings.append(now, v, y)
+        readings.drop_before(now - READINGS_TIME, FEWEST)
         self._count_same(v, y)
         if self.known and self._is_outside(y, now_ns):
             return
@@ -238,23 +238,20 @@ class RelationRule(Rule):
 
     def _is_outside(self, y: float, now_ns: int) -> bool:
         """Return whether a displacement is not near the known ones at its voltage."""
-        recent: list[float] = []
-        for t, v, _ in reversed(self._readings):
-            if len(recent) >= 2 and now_ns * 1e-9 - t > self._rule.lag:
-                break
-            recent.append(v)
-        low, high = self._known.allowed(min(recent), max(recent), self._rule)
+        t, v, _ = self._readings.columns
+        recent = v[min(int(np.searchsorted(t, now_ns * 1e-9 - self._rule.lag)), max(t.size - 2, 0)) :]
+        low, high = self._known.allowed(float(recent.min()), float(recent.max()), self._rule)
         outside = "" if low <= y <= high else "outside"
         if self._outside.note(outside, now_ns, LASTS_NS):
             self._find(
                 outside,
-                f"reads {y * 1e6:.6g} µm at {recent[0]:.4g} V, where {low * 1e6:.6g} to {high * 1e6:.6g} µm are "
+                f"reads {y * 1e6:.6g} µm at {recent[-1]:.4g} V, where {low * 1e6:.6g} to {high * 1e6:.6g} µm are "
                 "possible after what it read before in this run; check the sensor",
             )
         return bool(outside)
 
     def _judge_slope(self, now_ns: int) -> None:
-        t, v, y = np.array(self._readings).T
+        t, v, y = self._readings.columns
         known, rule = self._known, self._rule
         known.learn_noise(y)
         if not self.known:

@@ -1,13 +1,13 @@
 """Readings of a sensor against the displacements that were expected: silent, stuck, inverted or noisy."""
 
-from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
-from math import inf
+from math import inf, sqrt
 
 import numpy as np
 
 from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays.latest_rows import LatestRows
 from slpi_ros.compensator.monitor import Finding, Lasting, Rule, Silence
 from slpi_ros.io.messages import SECOND_NS
 
@@ -15,6 +15,8 @@ from slpi_ros.io.messages import SECOND_NS
 FEWEST, FEWEST_SHIFTED, KEPT = 8, 4, 4096
 # Standard deviation of a second difference, in those of the single values.
 BEND = 6.0**0.5
+# Share of a sum of squares below which its variance is the rounding of the arithmetic.
+ROUNDING = 1e-12
 
 
 @dataclass(frozen=True)
@@ -46,17 +48,19 @@ class SensorLimits:
 
 def slopes(expected: FloatArray, reading: FloatArray, limits: FollowingLimits) -> Iterator[tuple[float, float]]:
     """Yield slope and standard error of readings over what is expected, shape (N,) each, for each delay of them."""
-    latest = int(limits.late * expected.size)
+    x, y = expected - expected.mean(), reading - reading.mean()
+    # Sums of the first so many values, so that a delay costs a single product.
+    sum_x, sum_y, square_x, square_y = (np.append(0.0, np.cumsum(each)) for each in (x, y, x * x, y * y))
+    latest = int(limits.late * x.size)
     for shift in sorted({round(share * latest) for share in np.linspace(0.0, 1.0, limits.shifts)}):
-        early, late = expected[: expected.size - shift], reading[shift:]
-        centred = early - early.mean()
-        power = float(centred @ centred)
-        if early.size < FEWEST_SHIFTED or power <= 0.0:
+        count = x.size - shift
+        early, late = float(sum_x[count]), float(sum_y[-1] - sum_y[shift])
+        power = float(square_x[count]) - early * early / count
+        if count < FEWEST_SHIFTED or power <= ROUNDING * square_x[count]:
             continue
-        rest = late - late.mean()
-        slope = float(centred @ rest) / power
-        left = rest - slope * centred
-        yield slope, float(np.sqrt(left @ left / max(early.size - 2, 1) / power))
+        product = float(x[:count] @ y[shift:]) - early * late / count
+        left = float(square_y[-1] - square_y[shift]) - late * late / count - product * product / power
+        yield product / power, sqrt(max(left, 0.0) / max(count - 2, 1) / power)
 
 
 def misfit(expected: FloatArray, reading: FloatArray, limits: FollowingLimits) -> tuple[str, float]:
@@ -79,7 +83,7 @@ class SensorRule(Rule):
         self.fault_time = 0.0
         self.excused = False  # whether the readings tell of an oscillation, which another rule judges
         self._limits = limits or SensorLimits()
-        self._readings: deque[tuple[int, float, float]] = deque(maxlen=KEPT)  # ns, expected (m), reading (m)
+        self._readings = LatestRows(KEPT, 3)  # ns, expected (m), reading (m)
         self._silence: Silence | None = None  # None: not yet awaited
         self._suspect = Lasting()
 
@@ -93,7 +97,7 @@ class SensorRule(Rule):
         """Take a reading (m), and the displacement of the model (m) at that time."""
         if self._silence:
             self._silence.hear(now_ns)
-        self._readings.append((now_ns, expected, reading))
+        self._readings.append(now_ns, expected, reading)
 
     def check(self, now_ns: int) -> Finding | None:
         """Return the fault that has lasted for the fault time at `now_ns`; None without one."""
@@ -109,12 +113,10 @@ class SensorRule(Rule):
 
     def _look(self, now_ns: int) -> tuple[str, str]:
         """Return the kind and the reason of the fault that the readings of the last fault time show; "" if none."""
-        oldest_ns = now_ns - int(self.fault_time * SECOND_NS)
-        while self._readings and self._readings[0][0] < oldest_ns:
-            self._readings.popleft()
+        self._readings.drop_before(now_ns - int(self.fault_time * SECOND_NS))
         if len(self._readings) < FEWEST:
             return "", ""
-        _, expected, reading = np.array(self._readings, dtype=float).T
+        _, expected, reading = self._readings.columns
         limits, model = self._limits, float(np.ptp(expected))
         # Second differences remove what moves evenly.
         scatter, smooth = (float(np.std(np.diff(each, 2))) / BEND for each in (reading, expected))

@@ -135,8 +135,8 @@ class Judge:
         def explains(name: str) -> bool:
             if not is_plausible(now.effect(name), now):
                 return False
-            # A free course of one record is refuted by nothing but what it leaves, and of several records fits what
-            # the others have in common, too: there it has to be more than noise.
+            # A free course, such as drift, fits what is slow. In a single record it has to leave no more than noise;
+            # beside other records there has to be more than noise without it.
             if now.effect(name).courses and (now.held_out.rms > little if single else rest[name].rms <= little):
                 return False
             # What goes on from before the records is a course of theirs, which needs no effect.

@@ -9,7 +9,7 @@ from scipy.special import stdtr
 from slpi_ros.arrays import FloatArray
 from slpi_ros.diagnosis.held_out import Loss, in_blocks
 
-# Largest probability that chance makes any of all sets that were tried better.
+# Level of significance of all sets that were tried, together.
 CHANCE = 0.001
 # A contribution below this share of the sensor's noise is not told.
 LEAST = 0.1
@@ -26,7 +26,10 @@ LEAST_CHANCE = 1e-12
 
 
 def beats(one: Loss, other: Loss, noise: float, trials: float = 1.0) -> bool:
-    """Return whether a joint fit predicts better than another one, by more than chance and a tenth of the noise (m)."""
+    """Return whether a joint fit predicts better than another one, by more than chance and `LEAST` of the noise (m).
+
+    And is clearly worse on no record that is left out.
+    """
     own, its = one.beside(other)
     fall = float(np.mean(its**2) - np.mean(own**2))
     return fall > (LEAST * noise) ** 2 and carries_over(one, other) and chance(one, other, trials) <= CHANCE

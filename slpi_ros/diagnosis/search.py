@@ -76,7 +76,7 @@ class EffectSet:
 
     @property
     def numbers(self) -> int:
-        """How many numbers the effects have."""
+        """Number of free parameters of the effects."""
         return sum(free(effect).size for effect in self.effects)
 
     @property
@@ -123,7 +123,6 @@ class Choice:
     removed: frozenset[str]
     forms: tuple[Form, ...]
     square: float  # m^2, mean
-    blocks: FloatArray  # m^2, sums over blocks
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -182,9 +181,12 @@ class Library:
         """Return a set with what is left to first order, one and the same for the same set."""
         key = removed, frozenset(forms)
         if key not in self._known:
-            loss = self.held_out.loss(*self.columns(removed, forms))
-            self._known[key] = Choice(removed, forms, loss.square, loss.blocks)
+            self._known[key] = Choice(removed, forms, self.held_out.square(*self.columns(removed, forms)))
         return self._known[key]
+
+    def blocks(self, choice: Choice) -> FloatArray:
+        """Return the sums of squares over blocks, m^2, of what is left to first order."""
+        return self.held_out.loss(*self.columns(choice.removed, choice.forms)).blocks
 
     def ban(self, forms: Sequence[Form]) -> None:
         """Leave out forms that have shown to mean nothing."""
@@ -196,15 +198,13 @@ class Library:
         target, chosen, _ = self.columns(removed, taken)
         whole = self.held_out.whole
         vector = whole[:, target].sum(axis=1)
-        if chosen:
-            inner = whole[np.ix_(chosen, chosen)]
-            size = np.sqrt(np.maximum(np.diag(inner), 1e-300))
-            scaled = inner / np.outer(size, size) + RIDGE * np.eye(size.size)
-            beside = whole[chosen] / size[:, None]
-            solution = np.linalg.lstsq(scaled, np.column_stack([beside, vector[chosen] / size]), rcond=RIDGE)[0]
-            vector = vector - beside.T @ solution[:, -1]
-            whole = whole - beside.T @ solution[:, :-1]
-        size = np.sqrt(np.maximum(np.diag(self.held_out.whole), 1e-300))
+        inner = whole[np.ix_(chosen, chosen)]
+        size = np.sqrt(np.maximum(np.diag(inner), 1e-300))
+        scaled = inner / np.outer(size, size) + RIDGE * np.eye(size.size)
+        beside = whole[chosen] / size[:, None]
+        fitted = np.linalg.lstsq(scaled, np.column_stack([beside, vector[chosen] / size]), rcond=RIDGE)[0]
+        vector = vector - beside.T @ fitted[:, -1]
+        size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
         left_out = {*once, *(form.name for form in taken)}
         gains: dict[Form, float] = {}
         # Many small systems, those of one size at once.
@@ -214,7 +214,8 @@ class Library:
                 of_size.setdefault(form.numbers, []).append(form)
         for numbers, forms in of_size.items():
             at = np.array([form.first for form in forms])[:, None] + np.arange(numbers)
-            own = whole[at[:, :, None], at[:, None, :]] / (size[at][:, :, None] * size[at][:, None, :])
+            own = whole[at[:, :, None], at[:, None, :]] - np.einsum("kfi,kfj->fij", beside[:, at], fitted[:, at])
+            own /= size[at][:, :, None] * size[at][:, None, :]
             wanted = vector[at] / size[at]
             solution = np.linalg.solve(own + 1e-6 * np.eye(numbers), wanted[:, :, None])[:, :, 0]
             gains.update(zip(forms, np.sum(wanted * solution, axis=1).tolist(), strict=True))
@@ -292,8 +293,8 @@ def _each(forms: Sequence[Candidate], gains: FloatArray) -> EachRecord | None:
 class Search:
     """Search for the set that predicts best, from a joint fit without new effects.
 
-    All sets that were fitted are in `pool`, by name and number of numbers; `trials` is the number of independent ones
-    of those that were compared. With `names` only these effects are looked for.
+    `pool` holds the best fit of each set of names and number of parameters; `trials` is the number of independent
+    comparisons among the sets that were compared. With `names` only these effects are looked for.
     """
 
     def __init__(self, base: JointFit, names: Sequence[str] | None = None) -> None:
@@ -313,7 +314,7 @@ class Search:
                 break
             gained = 1.0 - best.held_out.square / now.held_out.square
             refined = best.refined(CONVERGED)
-            # What the effects left out of the hysteresis, it may follow more closely.
+            # The hysteresis, without what the effects took out of it, may need another smoothness.
             now = (refined if refined.held_out.square < best.held_out.square else best).smoothed()
             self._note(now)
             if gained < LEAST_GAINED:
@@ -324,7 +325,7 @@ class Search:
         """Return the best one of the sets in reach that are worth fitting, or `now`."""
         library, best = Library(now, self.names), now
         choices = library.choices(self.fixed)
-        self.trials = max(self.trials, independent_trials(now.held_out.blocks, [one.blocks for one in choices]))
+        self.trials = max(self.trials, independent_trials(now.held_out.blocks, [*map(library.blocks, choices)]))
         tried = set[Choice]()
         for _ in range(MOST_TRIED):
             choice = next((one for one in _worth_fitting(choices, now) if one not in tried), None)

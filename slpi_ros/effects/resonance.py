@@ -237,8 +237,8 @@ class Resonance(Effect):
     is_filter = True
     what = "modes of the mechanics, ringing or well damped, each with its share of the motion"
     compensated = (
-        "on trajectories exactly; sample by sample if a part of the motion follows at once, else what would ring is "
-        "taken out"
+        "exactly where `slpi compensate` has the whole path; sample by sample, as in the compensator, if a part of the "
+        "motion follows at once, else what would ring is taken out"
     )
     time_shift = "partly"
     looks_ahead = True

@@ -35,7 +35,7 @@ def resolved(omega: float) -> float:
     return 4.0 * SPACING / ((HISTORY - 4) * omega)
 
 
-class Known(NamedTuple):
+class ExportedLaws(NamedTuple):
     """The fields of `slpi_ros.effects.paths.Laws` that the exported inverse has, in its order."""
 
     lag: float
@@ -82,7 +82,9 @@ class ExportedAxis:
                 known = bool(effect.shift) or effect.passes != (-inf, inf) or effect.acts_on == "voltage"
             else:
                 laws = effect.laws()
-                known = isinstance(effect, Surroundings) or (bool(laws) and set(laws or {}) <= set(Known._fields))
+                known = isinstance(effect, Surroundings) or (
+                    bool(laws) and set(laws or {}) <= set(ExportedLaws._fields)
+                )
             refused += [] if known else [effect.name]
         refused += [effect.name for effect in chain.shared if not effect.coupling]
         if refused:

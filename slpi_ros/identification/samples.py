@@ -273,7 +273,7 @@ def _require_enough(record: Record, axis: str, count: int, start: float | None, 
 
 
 def _examined(t: FloatArray, v: FloatArray, y: FloatArray, fitted: Mask, where: str) -> Samples:
-    """Return samples with a finite voltage without outliers, held, stuck and mixed readings, and voltage noise."""
+    """Return the samples, with a smooth voltage; outliers and repeated, stuck and mixed readings are not `fitted`."""
     # The mask `fitted` has at least `FEWEST` samples and is modified in place. `where` names the record in the error of
     # signals without motion; "" for a part of a record, which is not tested.
     known = np.flatnonzero(fitted)

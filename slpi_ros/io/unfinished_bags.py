@@ -59,6 +59,21 @@ def abandoned_in(partial: Path) -> Path | None:
     return bag if is_one and not is_being_written(partial) else None
 
 
+def set_aside(folder: Path, mark: str) -> None:
+    """Rename the bags that killed recorders left in a folder: `mark` and the old name, by which they are read."""
+    for partial in sorted(folder.glob(partial_path(folder / "*").name)):
+        name = partial.name[1:].removesuffix(".partial")
+        if name.startswith(mark) or not partial.is_dir() or is_being_written(partial):
+            continue
+        number, aside = 1, folder / f"{mark}{name}"
+        while partial_path(aside).exists():
+            number, aside = number + 1, folder / f"{mark}{name}_{number}"
+        # First the bag: interrupted here, the second call completes it.
+        if (partial / name).is_dir():
+            (partial / name).rename(partial / aside.name)
+        partial.rename(partial_path(aside))
+
+
 def place_of(path: Path) -> Path:
     """Return where the bag of a path is: there, or where a killed recorder left it, which both paths may name."""
     partial = path if path.is_dir() or not path.name else partial_path(path)

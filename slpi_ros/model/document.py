@@ -58,7 +58,8 @@ def parse_model(text: str, source: str) -> StageModel:
     if schema not in (SCHEMA, EARLIER):
         found = textwrap.shorten(repr(schema), 80)
         raise ModelError(
-            f"{source}: schema is {found}, this version reads {SCHEMA!r} and {EARLIER!r}; identify the stage again"
+            f"{source}: schema is {found}, this version reads {SCHEMA!r} and {EARLIER!r}; use the "
+            "version of slpi_ros that wrote it, or identify the stage again"
         )
     # All that an earlier document may hold means the same.
     document["schema"] = SCHEMA

@@ -22,7 +22,7 @@ from slpi_ros.io.bag_writer import BagWriter
 from slpi_ros.io.desired import read_path
 from slpi_ros.io.messages import JointStateEncoder
 from slpi_ros.io.stage_name import same_stage
-from slpi_ros.io.unfinished_bags import partial_path
+from slpi_ros.io.unfinished_bags import set_aside
 from slpi_ros.model.limits import volts
 from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.calibration_job import PATH, STATE, CalibrationJob, CalibrationOutcome, Wanted, stage_of_kept
@@ -440,9 +440,7 @@ def _prepare(output: Path, *, resume: bool) -> None:
     try:
         if not resume and any(output.iterdir()):
             raise UsageError(f"{output}: not empty; choose another folder, or go on with resume:=true")
-        for path in sorted(output.glob(partial_path(output / "*").name)):
-            if path.is_dir():
-                path.rename(_free(path.with_name(f"killed_{path.name[1:].removesuffix('.partial')}")))
+        set_aside(output, "killed_")
     except OSError as error:
         raise RecordError(f"{output}: {error.strerror}; choose another folder") from None
 

@@ -18,7 +18,7 @@ from slpi_ros.io.bag_files import BagWatch
 from slpi_ros.io.bag_reader import read_bag
 from slpi_ros.io.bag_writer import BagWriter
 from slpi_ros.io.digests import digests
-from slpi_ros.io.unfinished_bags import NOTE, is_being_written, partial_path, place_of
+from slpi_ros.io.unfinished_bags import NOTE, is_being_written, partial_path, place_of, set_aside
 
 # Messages on the disk, and further ones that the process takes with it; the second time SQLite has written some of
 # these to its file, and needs its journal to undo them.
@@ -120,6 +120,22 @@ def test_a_watched_folder_gives_it_once_its_writer_is_dead(tmp_path):
     (found,) = watch.poll()
     assert len(read_bag(found)) >= SYNCED
     assert watch.poll() == []
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_it_is_set_aside_and_read_by_its_new_name(tmp_path, storage):
+    names = ["killed_bag", "killed_bag_1"]
+    for _ in names:
+        killed(writing(tmp_path / "bag", storage))
+        set_aside(tmp_path, "killed_")
+        assert not partial_path(tmp_path / "bag").exists()
+    for name in names:
+        assert len(read_bag(tmp_path / name)) >= SYNCED and NOTE in read_bag(tmp_path / name).notes
+    (tmp_path / ".empty.partial").mkdir()
+    writer = writing(tmp_path / "bag", storage)
+    set_aside(tmp_path, "killed_")
+    assert not partial_path(tmp_path / "empty").exists() and partial_path(tmp_path / "bag").exists()
+    killed(writer)
 
 
 def test_a_complete_bag_of_the_name_comes_first(tmp_path):

@@ -21,6 +21,7 @@ from slpi_ros.io.bag_reader import read_bag  # noqa: E402
 from slpi_ros.io.bag_writer import write_bag  # noqa: E402
 from slpi_ros.io.record import Record  # noqa: E402
 from slpi_ros.io.tables import write_table  # noqa: E402
+from slpi_ros.io.unfinished_bags import partial_path  # noqa: E402
 from slpi_ros.model.document import parse_model  # noqa: E402
 from slpi_ros.nodes.calibration_job import PATH  # noqa: E402
 from slpi_ros.nodes.calibrator import DECLARATIONS, settings_of  # noqa: E402
@@ -140,7 +141,8 @@ def test_a_killed_calibration_is_resumed_with_the_bags_that_are_complete(tmp_pat
             assert ended(graph, node) == 1
         require_safe(stage)
     names = {path.name for path in (tmp_path / "out").iterdir()}
-    assert names == {"01_check", "killed_02_calibration", "interrupted_02_calibration"}
+    aside = partial_path(tmp_path / "out" / "killed_02_calibration")
+    assert names == {"01_check", aside.name, "interrupted_02_calibration"}
     assert np.array_equal(read_bag(tmp_path / "out" / "01_check").time_ns, first)
 
 

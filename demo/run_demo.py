@@ -37,7 +37,7 @@ from slpi_ros.simulation.stage import Stage  # noqa: E402
 RATE = 100.0
 V_MIN, V_MAX, SLEW = 0.0, 100.0, 1000.0
 # The calibration runs faster than in life; the comparison is in real time, on the next day of the stage, after it has
-# been switched on for as long as at the end of the calibration: a stage that still warms up drifts faster.
+# been switched on for about as long as at the end of the calibration: a stage that still warms up drifts faster.
 SPEED = 2.0
 NOISE = 8e-9
 # The path stays away from the ends of what can be reached by this share: the zero may go on moving.

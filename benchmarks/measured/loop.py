@@ -44,7 +44,7 @@ def draw(folder: Path, path: Path) -> None:
         if method.name in MODELS:
             run, _, _ = free_run(method.fit(records), one, records)
             run = run - np.mean((run - one.y)[shown])
-            name = "SLPI" if method.name.startswith("SLPI") else method.name
+            name = method.name
             colour = MODELS[method.name]
             loop.plot(one.v[shown], share * (run[shown] - zero), color=colour, linewidth=1.0, label=name)
             errors.plot(t, share * (run - one.y)[shown], color=colour, label=name)

@@ -37,6 +37,8 @@ class Source:
         What was measured.
     moves : bool
         Whether a motion was measured; False for a polarisation.
+    piezo : bool
+        Whether that of a piezo.
     """
 
     repository: str
@@ -44,6 +46,7 @@ class Source:
     licence: str
     device: str
     moves: bool = True
+    piezo: bool = False
 
     def __post_init__(self) -> None:
         _require(bool(_REPOSITORY.fullmatch(self.repository)), f"repository '{self.repository}' is not owner/name")

@@ -132,7 +132,7 @@ class Axis:
         self.surroundings |= values
         self.motion.wake()
         self.stream.surround(values)
-        if self.loop.measured:
+        if self.loop.follows_total:
             self.loop.applied(self.stream).surround(values)
         self.uncertainty.surround(values)
 
@@ -142,7 +142,7 @@ class Axis:
         self.use(model, self.prepare(model))
         self.zero = zero
         self.loop.offsets.forget()
-        if self.loop.measured:
+        if self.loop.follows_total:
             self.loop.close(self.stream, self.samples.given_ns)
 
     def check_limits(self, limits: Limits) -> Limits:
@@ -192,16 +192,16 @@ class Axis:
         if voltage != self.output.voltage:
             self.output.start(voltage)
         self.stream.pace = self.output
-        if self.loop.measured and moved:
+        if self.loop.follows_total and moved:
             self.loop.close(self.stream, self.samples.given_ns)
-        elif self.loop.measured:
+        elif self.loop.follows_total:
             self.loop.restart(self.stream, self.samples.given_ns)
         chosen, confidence = self.initial.choose(self.model, self.limits, self.stream, self.surroundings, now_ns)
         self.confidence = confidence or self.confidence
         if chosen:
             chosen.pace, chosen.limits = self.stream.pace, self.output.limits
             self.stream = chosen
-            if self.loop.measured:
+            if self.loop.follows_total:
                 self.loop.close(chosen, self.samples.given_ns)
 
     # Motion
@@ -341,7 +341,7 @@ class Axis:
         v = self._output(dt, y, self.stream.move(dt, y, now_ns), now_ns)
         self.initial.assumed = None
         self.loop.offsets.leave_reset()
-        if self.loop.measured:
+        if self.loop.follows_total:
             assert self.model
             self.loop.setpoint(y, now_ns, max(round(self.model.chain.delay * SECOND_NS), 0) if early else 0)
         if self.uncertainty.on:
@@ -351,7 +351,7 @@ class Axis:
     def _output(self, dt: float, y: float, v: float, now_ns: int) -> float:
         """Output and return the voltage (V) for the setpoint `y` (m) with feedforward `v` (V)."""
         stream = self.stream
-        if self.loop.measured:
+        if self.loop.follows_total:
             v = self.loop.correct(dt, y, v, stream.coupled, now_ns)
         self.held = self.slewing = False
         if stream.missed:
@@ -374,6 +374,6 @@ class Axis:
             if fresh:
                 self.initial.read(x, now_ns)
             return
-        if not self.loop.measured:
+        if not self.loop.follows_total:
             self.loop.close(self.stream, self.samples.given_ns)
         self.loop.measure(x, expected, now_ns, not self.motion.drives, self.tracking)

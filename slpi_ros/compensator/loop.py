@@ -33,14 +33,14 @@ class Loop:
     """
 
     _sensor: StreamingSensor  # from the first model on
-    # From the first reading on.
+    # While `follows_total`.
     _applied: StreamingInverse
     _feedback: Feedback
     _residuals: ResidualWindow
 
     def __init__(self, settings: LoopSettings, output: RateLimiter, axis: str = "") -> None:
         self.settings, self._output = settings, output
-        self.measured = False  # whether there was a reading: from then on the total voltage is followed
+        self.follows_total = False  # from the first reading on, or at once with feedback
         self.active = False  # whether readings correct it
         self.fault: Finding | None = None  # for which the feedback is off
         self.sensor = SensorRule(1.0, axis=axis)  # whether its readings follow the model
@@ -61,7 +61,7 @@ class Loop:
     @property
     def correction(self) -> float:
         """Correction contained in the present voltage, volts."""
-        return self._feedback.correction if self.measured else 0.0
+        return self._feedback.correction if self.follows_total else 0.0
 
     @property
     def state(self) -> str:
@@ -70,18 +70,18 @@ class Loop:
             return "off"
         if self.fault:
             return "fault"
-        if not (self.measured and self._feedback.acting):
+        if not (self.follows_total and self._feedback.acting):
             return "holding"
         return "saturated" if abs(self.correction) >= self.settings.correction_limit else "on"
 
     @property
     def drift(self) -> Drift | None:
         """Residual (measured - model) statistics; None if there are too few measurements."""
-        return self._residuals.drift() if self.measured else None
+        return self._residuals.drift() if self.follows_total else None
 
     def applied(self, stream: StreamingInverse) -> StreamingInverse:
         """Return the inverse that follows the total voltage: that of the axis, `stream`, before the first reading."""
-        return self._applied if self.measured else stream
+        return self._applied if self.follows_total else stream
 
     # Model and settings
 
@@ -94,7 +94,7 @@ class Loop:
         self._sensor = model.streaming_sensor()
         late = self._sensor.late or model.chain.delay > 0.0
         self._setpoint = Sensed(self._sensor, stream.uncoupled_displacement) if late else None
-        if self.measured:
+        if self.follows_total:
             self._applied = continue_from(model, allowed, self._applied)
             self._forget_residuals()
             if self.fault is None or self.fault.kind == UNSTABLE:
@@ -124,10 +124,10 @@ class Loop:
         if self.fault:
             # What the sensor told before does not count any more.
             self.sensor.begin()
-        self.settings, self.active = settings, self.measured and settings.enabled
+        self.settings, self.active = settings, self.follows_total and settings.enabled
         self.fault = self._unstable()
         self.oscillation.begin(now_ns)
-        if not self.measured:
+        if not self.follows_total:
             if settings.enabled and stream is not None:
                 self.close(stream, now_ns)
             return
@@ -155,20 +155,20 @@ class Loop:
         stream.pace = self._output.copy()
         self.sensor.begin()
         self.oscillation.begin(now_ns)
-        self.measured, self.active = True, settings.enabled
+        self.follows_total, self.active = True, settings.enabled
         self.driven_ns = self.due_ns = now_ns
         self._between = 0.0
         self._feedback.switch(settings.enabled and not self.fault)
 
     def leave(self, stream: StreamingInverse) -> None:
         """Let the inverse of the axis go on from the total voltage."""
-        if self.measured:
+        if self.follows_total:
             stream.restore(self._applied.snapshot())
         stream.pace = self._output
 
     def settle(self, stream: StreamingInverse, now_ns: int) -> None:
         """Start again after motion without setpoints."""
-        if self.measured:
+        if self.follows_total:
             self.restart(stream, now_ns)
             self._forget_residuals()
         if self._setpoint:
@@ -221,7 +221,7 @@ class Loop:
 
     def listen(self) -> None:
         """Hold the correction while the rule of oscillations listens, and go on without a voltage step."""
-        if self.measured:
+        if self.follows_total:
             self._feedback.listen(self.oscillation.held)
 
     # Voltages
@@ -257,7 +257,7 @@ class Loop:
 
     def follow(self, voltage: float, dt: float, now_ns: int) -> None:
         """Follow a voltage (V) without setpoint, `dt` (s) after the last one."""
-        if self.measured:
+        if self.follows_total:
             self.driven_ns, self._between = now_ns, 0.0
             self._expect(self._applied.drive(voltage, dt), now_ns)
 

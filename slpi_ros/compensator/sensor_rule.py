@@ -54,13 +54,16 @@ def slopes(expected: FloatArray, reading: FloatArray, limits: FollowingLimits) -
     latest = int(limits.late * x.size)
     for shift in sorted({round(share * latest) for share in np.linspace(0.0, 1.0, limits.shifts)}):
         count = x.size - shift
+        if count < FEWEST_SHIFTED:
+            continue
         early, late = float(sum_x[count]), float(sum_y[-1] - sum_y[shift])
         power = float(square_x[count]) - early * early / count
-        if count < FEWEST_SHIFTED or power <= ROUNDING * square_x[count]:
+        if power <= ROUNDING * square_x[count]:
             continue
         product = float(x[:count] @ y[shift:]) - early * late / count
         left = float(square_y[-1] - square_y[shift]) - late * late / count - product * product / power
-        yield product / power, sqrt(max(left, 0.0) / max(count - 2, 1) / power)
+        left = max(left, ROUNDING * float(square_y[-1]))
+        yield product / power, sqrt(left / max(count - 2, 1) / power)
 
 
 def misfit(expected: FloatArray, reading: FloatArray, limits: FollowingLimits) -> tuple[str, float]:

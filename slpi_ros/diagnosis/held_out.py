@@ -95,7 +95,7 @@ class Products:
     def _add(self, new: IntArray) -> None:
         count = int(self._place.max()) + 1
         if count + new.size > self._asked.shape[1]:
-            size = 2 * (count + new.size)
+            size = min(2 * (count + new.size), self._columns.shape[1])
             asked = np.empty((self._asked.shape[0], size), order="F")
             products = np.empty((len(self._ends), size, size))
             asked[:, :count], products[:, :count, :count] = self._asked[:, :count], self._products[:, :count, :count]
@@ -196,7 +196,7 @@ class HeldOut:
     def square(self, target: Sequence[int], chosen: Sequence[int], positive: Collection[int] = ()) -> float:
         """Return the mean square (m^2) of what a fit of columns leaves of the sum of others."""
         sums = [division.square(target, chosen, positive) for division in self._divisions]
-        mean = float(np.sum(sums)) / self._records.size
+        mean = float(np.sum(sums)) / max(self._records.size, 1)
         return min(max(mean, 0.0), FARTHEST**2) * self._unit**2 if np.isfinite(mean) else FARTHEST**2 * self._unit**2
 
     def loss(self, target: Sequence[int], chosen: Sequence[int], positive: Collection[int] = ()) -> Loss:

@@ -148,6 +148,9 @@ class Equations:
             rows = np.flatnonzero(known)[np.argsort(fold[known], kind="stable")]
             errors = np.ones((rows.size, at.shape[1] + 1), order="F")
             errors[:, :-1] = missed[rows]
+            if record >= 0 and rows.size:
+                # Its zero is fitted anyway; far off, it would drown the errors in products.
+                errors[:, :-1] -= errors[:, :-1].mean(axis=0)
             last = tuple(np.searchsorted(fold[rows], range(1, each + 1 if record >= 0 else 3)).tolist())
             divisions.append(Division(errors, last, rest, size, places[rows], own, record < 0))
         total = inner - whole.T @ _solved(self.factor, whole)

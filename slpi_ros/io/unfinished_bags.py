@@ -66,7 +66,7 @@ def set_aside(folder: Path, mark: str) -> None:
         if name.startswith(mark) or not partial.is_dir() or is_being_written(partial):
             continue
         number, aside = 1, folder / f"{mark}{name}"
-        while partial_path(aside).exists():
+        while aside.exists() or partial_path(aside).exists():
             number, aside = number + 1, folder / f"{mark}{name}_{number}"
         # First the bag: interrupted here, the second call completes it.
         if (partial / name).is_dir():

@@ -395,7 +395,7 @@ class AxisLearner:
         assert self.best is not None
         self.correction = self.best.correction
         self._returned, self._settling, self._worst = 1, rms**2, max(self._worst, rms**2)
-        # What was learned of the last pass is not to make a riddle of the next one.
+        # A step that is taken of the last pass shall not hide what the next one shows.
         self.harmonics = self.harmonics.at(self.spectrum.of(self.best.correction), self.spectrum.of(self.best.reading))
         self._told = f"{why}; back to the best, at half the gain"
         self._blame_change(why)

@@ -94,7 +94,7 @@ def stage_of_kept(output: Path) -> str:
     """Return the name of the stage of the first bag in a folder that names one, "" if none does."""
     for bag in sorted(output.iterdir()):
         with suppress(SlpiError):
-            if bag.is_dir() and (name := stage_name(read_bag(bag, STATE).hardware_id)):
+            if bag.is_dir() and not bag.name.startswith(".") and (name := stage_name(read_bag(bag, STATE).hardware_id)):
                 return name
     return ""
 

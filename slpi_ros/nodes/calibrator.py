@@ -204,7 +204,8 @@ class Calibrator(Node):
 
     Nothing is moved while stage_state is missing or another node publishes voltages. If stage_state reports what the
     voltages cannot have caused (`slpi_ros.calibration.drive_monitor`), another publisher appears or a bag cannot be
-    written, the voltages return to rest within the limits. An interrupted drive is kept as ``interrupted_NAME``.
+    written, the voltages return to rest within the limits. An interrupted drive is kept as ``interrupted_NAME``,
+    that of a killed node is read as ``killed_NAME`` once the calibration was resumed.
     """
 
     def __init__(self) -> None:

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable
 from contextlib import contextmanager
 
+import numpy as np
 import pytest
 
 rclpy = pytest.importorskip("rclpy")
@@ -198,8 +199,10 @@ def test_stage_time_runs_faster_on_request():
         bench.spin_until(lambda: len(clocks) >= 2, process)
         begun, first = time.monotonic(), clocks[-1].clock
         bench.spin_until(lambda: clocks[-1].clock.sec - first.sec >= 40, process)
-        # The clock is that of the stage, however late its messages are.
-        assert 3 * (time.monotonic() - begun) < 39
+        assert time.monotonic() - begun < 39
+        # However late its messages are, no sample is lost.
+        times = [each.clock.sec * 10**9 + each.clock.nanosec for each in clocks]
+        assert {int(step) for step in np.diff(times) if step <= 10**7} == {10**7}
         stamps = [state.header.stamp.sec for state in bench.states]
         assert stamps[-1] - stamps[0] >= 4
 

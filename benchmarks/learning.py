@@ -339,14 +339,13 @@ def keep(stages: Mapping[int, tuple[Specimen, Mapping[str, Any]]], passes: int) 
     modes = [one.frequency for one in specimens]
     noise = [1e9 * one.noise for one in specimens]
     what = (
-        f"a raster of 20 Hz that repeats, {len(stages)} simulated stages with modes of {min(modes):.0f} to "
-        f"{max(modes):.0f} Hz and {min(noise):.0f} to {max(noise):.0f} nm of sensor noise, rms error, median (least to "
-        f"largest): inverse alone; proportional-integral feedback; `learn` after {passes} passes; learning without a "
-        "model of the dynamics: from a straight line, from the inverse (this and the feedback with the best of several "
-        "gains)"
+        f"a raster of 20 Hz that repeats, {len(stages)} stages with modes of {min(modes):.0f} to {max(modes):.0f} Hz "
+        f"and {min(noise):.0f} to {max(noise):.0f} nm of noise, rms error, median (least to largest): inverse alone; "
+        f"feedback; `learn`, {passes} passes; learning from the inverse without a model of the dynamics (this and the "
+        "feedback with the best of several gains)"
     )
     columns = [[one["learner"][0] for one in errors]]
-    columns += [[one[method][-1] for one in errors] for method in ("PI", "learner", "line", "inverse")]
+    columns += [[one[method][-1] for one in errors] for method in ("PI", "learner", "inverse")]
     said = "; ".join(f"{np.median(each):.3g} ({min(each):.3g} to {max(each):.3g}) nm" for each in columns)
     chosen = f"--seed {min(stages)} --count {len(stages)} --paths '{KEPT_PATH}'"
     kept.write_row("learning", what, said, f'make bench-learning LEARNING="{chosen}"')

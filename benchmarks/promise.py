@@ -190,12 +190,12 @@ def main() -> None:
     )
     if options.keep:
         what = (
-            f"calibrator, {options.stages} simulated stages with one or two hidden effects: stages with all causes "
-            "found; mean error that it promises, of stroke, median; stages on which scans five minutes later, after a "
-            f"reset and after a restart, have it within a factor of {FACTOR:g}; others of which it said that the "
-            "zero or the sensitivity goes on moving"
+            "calibrator, stages with one or two hidden effects: all causes found; mean error that it promises, of "
+            f"stroke, median; kept within a factor of {FACTOR:g} five minutes later, after a reset and after a "
+            "restart; told that zero or sensitivity go on moving"
         )
-        said = f"{right}; {100.0 * error:.3f} %; {good}; {told}"
+        whole = options.stages
+        said = f"{right} of {whole}; {100.0 * error:.3f} %; {good} of {whole}; {told} of the other {whole - good}"
         kept.write_row("promise", what, said, "make bench-promise")
 
 

@@ -61,8 +61,7 @@ def readme_table(rows: Rows, manifest: Manifest, date: str, command: str) -> str
         f"| device, judged on | {' | '.join(COLUMNS)} | best of the other methods |",
         f"|---|{'---|' * len(COLUMNS)}---|",
     ]
-    shown = by_device(rows, manifest)
-    for label, name in shown.items():
+    for label, name in by_device(rows, manifest).items():
         row, marked = rows[label], marks(rows[label])
         cells = [_cell(row.get(column, {}), marked.get(column, "")) for column in COLUMNS]
         others = {other: cell for other, cell in row.items() if other not in COLUMNS and "rms" in cell}
@@ -71,12 +70,11 @@ def readme_table(rows: Rows, manifest: Manifest, date: str, command: str) -> str
         lines.append(f"| {name} | {' | '.join(cells)} |")
     count = max(len(row) for row in rows.values())
     said = (
-        f"Rms error of the displacement predicted from voltages alone, without its mean, on data that were not fitted, "
-        f"in % of the range of these data; {date}, `{command}`. **Bold**: the least of {count} methods; *as good*: no "
-        f"significant difference to it (95 %), however large it looks where a record has few cycles; *line*: a "
-        f"straight line. One row for each device that moves: its middle one by *SLPI, causes* over the best other "
-        f"method, of two the worse.\n\n"
-        f"{headline(rows, shown, of_piezos(manifest))} [All {len(rows)} rows, all methods, with intervals]"
+        f"Rms error without its mean, in % of the range of the data, none of which were fitted; {date}, `{command}`. "
+        f"**Bold**: the least of {count} methods; *as good*: no significant difference to it (95 %); *line*: a "
+        f"straight line. One row for each device: its middle one by *SLPI, causes* over the best other method, of two "
+        f"the worse.\n\n"
+        f"{headline(rows, of_piezos(manifest))} [All {len(rows)} rows, all methods, with intervals]"
         f"(docs/explanation/measured.md)."
     )
     return "\n".join([*lines, "", said])
@@ -128,21 +126,27 @@ def of_piezos(manifest: Manifest) -> list[str]:
     ]
 
 
-def headline(rows: Rows, shown: Iterable[str], piezos: Sequence[str]) -> str:
-    """Return sentences with the ratios to the best other method of each row, to the classical models and to SLPI."""
+def headline(rows: Rows, piezos: Sequence[str]) -> str:
+    """Return sentences with the ratios to the best other method of each row, to PI and to SLPI."""
+    causes = compared(rows, ["SLPI"])
+    return (
+        f"*SLPI, causes* over the best **other** method, chosen afterwards for each row: in all {len(rows)} rows "
+        f"{compared(rows)} (95 %); in the {len(piezos)} rows of moving piezos "
+        f"{compared({label: rows[label] for label in piezos})}. Over PI, in all rows: {compared(rows, ['PI'])}. The "
+        f"causes make SLPI clearly better in {causes.wins} rows and worse in {causes.losses}, at worst by a factor of "
+        f"{max(causes.ratios):.2f} (offset included {max(causes.absolute):.2f})."
+    )
+
+
+def further(rows: Rows, shown: Iterable[str]) -> str:
+    """Return sentences with the ratios to PI with a lag, to the best other method of README's rows, and the times."""
     cells = [row["SLPI, causes"] for row in rows.values() if "rms" in row["SLPI, causes"]]
     fit, sample = ([float(cell[key]) for cell in cells] for key in ("fit_seconds", "sample_microseconds"))
     few = np.median(compared({label: rows[label] for label in shown}).ratios)
-    causes = compared(rows, ["SLPI"])
     return (
-        f"Error of *SLPI, causes* in all {len(rows)} rows, over that of the best **other** method, chosen afterwards "
-        f"for each row: {compared(rows)} (95 %). In the {len(piezos)} rows of moving piezos alone: "
-        f"{compared({label: rows[label] for label in piezos})}. In the rows shown here the median is {few:.2f}.\n"
-        f"Over that of PI, in all rows: {compared(rows, ['PI'])}. Over that of PI with a lag: "
-        f"{compared(rows, ['PI, lag'])}. The causes make SLPI clearly better in {causes.wins} rows and worse in "
-        f"{causes.losses}, at worst by a factor of {max(causes.ratios):.2f} (offset included "
-        f"{max(causes.absolute):.2f}). A fit takes {np.median(fit):.0f} s on one core, the longest {max(fit):.0f} s; "
-        f"the prediction of a sample {np.median(sample):.2f} µs (medians)."
+        f"*SLPI, causes* over PI with a lag, in all rows: {compared(rows, ['PI, lag'])}. In the rows of README the "
+        f"median over the best other method is {few:.2f}. A fit of *SLPI, causes* takes {np.median(fit):.0f} s on one "
+        f"core, the longest {max(fit):.0f} s; the prediction of a sample {np.median(sample):.2f} µs (medians)."
     )
 
 
@@ -174,7 +178,8 @@ def what_is_judged(manifest: Manifest) -> list[str]:
 def full_tables(rows: Rows, manifest: Manifest, date: str, command: str) -> str:
     """Return the tables of the page: every method on every row."""
     names = list(dict.fromkeys(name for row in rows.values() for name in row))
-    parts = [f"{date}, `{command}`.", "", "### What is judged", "", *what_is_judged(manifest)]
+    said = further(rows, by_device(rows, manifest))
+    parts = [f"{date}, `{command}`. {said}", "", "### What is judged", "", *what_is_judged(manifest)]
     for title, figure, text in (
         ("Without the mean error", "rms", "{0[rms]:.3f} ({0[low]:.3f} to {0[high]:.3f})"),
         ("With the mean error", "absolute", "{0[absolute]:.3f}"),

@@ -8,7 +8,6 @@ so that thousands of choices can be compared.
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from functools import cached_property
-from itertools import pairwise
 
 import numpy as np
 import scipy.linalg
@@ -71,109 +70,46 @@ def in_blocks(values: FloatArray) -> FloatArray:
     return sums
 
 
-class Products:
-    """Products of the columns, shape (n, K), of a matrix over groups of its rows, computed where they are asked for.
-
-    The rows of a group follow each other, up to `ends`.
-    """
-
-    def __init__(self, columns: FloatArray, ends: Sequence[int]) -> None:
-        self._columns, self._ends = columns, ends
-        # What was asked for so far: places of the columns, copies of them, and their products in each group.
-        self._place = np.full(columns.shape[1], -1)
-        self._asked = np.empty((columns.shape[0], 0))
-        self._products = np.empty((len(ends), 0, 0))
-
-    def of(self, chosen: IntArray) -> FloatArray:
-        """Return the products of columns, shape (groups, k, k)."""
-        new = np.unique(chosen[self._place[chosen] < 0])
-        if new.size:
-            self._add(new)
-        at = self._place[chosen]
-        return self._products[:, at[:, None], at]
-
-    def _add(self, new: IntArray) -> None:
-        count = int(self._place.max()) + 1
-        if count + new.size > self._asked.shape[1]:
-            size = min(2 * (count + new.size), self._columns.shape[1])
-            asked = np.empty((self._asked.shape[0], size), order="F")
-            products = np.empty((len(self._ends), size, size))
-            asked[:, :count], products[:, :count, :count] = self._asked[:, :count], self._products[:, :count, :count]
-            self._asked, self._products = asked, products
-        own, both = slice(count, count + new.size), slice(count + new.size)
-        self._place[new] = np.arange(own.start, own.stop)
-        self._asked[:, own] = self._columns[:, new]
-        for product, (first, end) in zip(self._products, pairwise([0, *self._ends]), strict=True):
-            product[both, own] = self._asked[first:end, both].T @ self._asked[first:end, own]
-            product[own, both] = product[both, own].T
-
-
 @dataclass(frozen=True)
 class Division:
-    """Rows left out, fold by fold up to `ends`: what the rest predicts of them.
+    """Rows left out: what the rest predicts of them."""
 
-    The rows of the first fold are not judged. In blocks all others are alike; a record that is left out has an offset
-    of its own, and `own` columns, which are fitted to all of its folds but the judged one.
-    """
-
-    errors: FloatArray  # (n, K + 1), of each column, the hysteresis fitted to the rest; the last one is a constant
-    ends: tuple[int, ...]
+    errors: FloatArray  # (n, K), of each column, the hysteresis fitted to the rest
     rest: FloatArray  # (K, K), products of the columns in the rest, the hysteresis eliminated
     size: FloatArray  # (K,), root of the sum of squares of each column in all data
-    place: IntArray  # (n,), where the errors belong
+    place: IntArray  # (n,), where the errors belong; -1: not judged
+    fold: IntArray  # (n,), fold of each row within a record that is left out; 0: never left out
     own: Mask  # (K,), columns that belong to the record left out alone; none for blocks of records
-    in_blocks: bool
 
     @cached_property
-    def _products(self) -> Products:
-        return Products(self.errors, self.ends)
+    def _judged(self) -> list[IntArray]:
+        """Rows of each fold that are judged."""
+        folds = range(1, int(self.fold.max(initial=0)) + 1)
+        return [np.flatnonzero((self.fold == fold) & (self.place >= 0)) for fold in folds]
 
-    def coefficients(self, target: Sequence[int], chosen: Sequence[int], positive: Collection[int]) -> FloatArray:
-        """Return the coefficients of the errors in each judged fold, shape (folds, k).
-
-        Of the sum of the columns `target` after a fit of the columns `chosen`: those of both, and of the constant.
-        """
-        signs, count = [k in positive for k in chosen], len(target)
+    def left(self, target: Sequence[int], chosen: Sequence[int], positive: Collection[int]) -> FloatArray:
+        """Return the errors, shape (n,), of the sum of the columns `target` after a fit of the columns `chosen`."""
+        y, columns = self.errors[:, target].sum(axis=1), self.errors[:, chosen]
         matrix, vector = self.rest[np.ix_(chosen, chosen)], self.rest[np.ix_(chosen, target)].sum(axis=1)
-        found = np.zeros((len(self.ends) - 1, count + len(chosen) + 1))
-        found[:, :count] = 1.0
-        if self.in_blocks:
-            found[:, count:-1] = -solved(matrix, vector, signs, self.size[chosen])
-            return found
-        folds = self._products.of(self._columns(target, chosen))
-        whole = folds.sum(axis=0)
-        beside = UNDETERMINED * whole[count:]
-        beside[:-1, count:-1] += matrix
-        known = beside[:, :count].sum(axis=1)
-        known[:-1] += vector
-        gains = solved(beside[:, count:], known, [*signs, False])
-        own = np.append(self.own[chosen], True)
-        found[:, count:][:, ~own] = -gains[~own]
-        at = count + np.flatnonzero(own)
-        others = whole[at] - folds[1:, at]
-        size = np.maximum(np.sqrt(np.diag(whole)[at]), 1e-150)
-        matrices = others[:, :, at] / np.outer(size, size) + RIDGE * np.eye(at.size)
-        found[:, at] = -_stack_solved(matrices, others @ found[0] / size) / size
-        return found
-
-    def square(self, target: Sequence[int], chosen: Sequence[int], positive: Collection[int]) -> float:
-        """Return the sum of the squared errors of the judged rows."""
-        found = self.coefficients(target, chosen, positive)
-        folds = self._products.of(self._columns(target, chosen))[1:]
-        return float(np.einsum("fi,fij,fj->", found, folds, found))
-
-    def left(
-        self, target: Sequence[int], chosen: Sequence[int], positive: Collection[int]
-    ) -> tuple[IntArray, FloatArray]:
-        """Return the places of the judged rows, and their errors, shape (n,) each."""
-        columns, found = self._columns(target, chosen), self.coefficients(target, chosen, positive)
-        errors = [
-            self.errors[first:end, columns] @ own for own, (first, end) in zip(found, pairwise(self.ends), strict=True)
-        ]
-        return self.place[self.ends[0] :], np.concatenate([np.empty(0), *errors])
-
-    def _columns(self, target: Sequence[int], chosen: Sequence[int]) -> IntArray:
-        return np.array([*target, *chosen, self.rest.shape[0]], dtype=np.int64)
+        if not self.own.any() and not self.fold.any():
+            gains = solved(matrix, vector, [k in positive for k in chosen], self.size[chosen])
+            return np.asarray(y - columns @ gains)
+        beside = np.column_stack([columns, np.ones(y.size)])
+        whole = UNDETERMINED * (beside.T @ beside)
+        whole[:-1, :-1] += matrix
+        gains = solved(
+            whole, UNDETERMINED * (beside.T @ y) + np.append(vector, 0.0), [*(k in positive for k in chosen), False]
+        )
+        own = np.append(self.own[list(chosen)], True)
+        y = y - beside[:, ~own] @ gains[~own]
+        beside = beside[:, own]
+        square, product = beside.T @ beside, beside.T @ y
+        size = np.sqrt(np.diag(square))
+        left = np.asarray(y - beside @ solved(square, product))
+        for rows in self._judged:
+            part = beside[rows]
+            left[rows] = y[rows] - part @ solved(square - part.T @ part, product - part.T @ y[rows], size=size)
+        return left
 
 
 class HeldOut:
@@ -193,18 +129,12 @@ class HeldOut:
         self._divisions, self.whole, self._unit = divisions, whole, unit
         self._samples, self._records, self._count = samples, records, count
 
-    def square(self, target: Sequence[int], chosen: Sequence[int], positive: Collection[int] = ()) -> float:
-        """Return the mean square (m^2) of what a fit of columns leaves of the sum of others."""
-        sums = [division.square(target, chosen, positive) for division in self._divisions]
-        mean = float(np.sum(sums)) / max(self._records.size, 1)
-        return min(max(mean, 0.0), FARTHEST**2) * self._unit**2 if np.isfinite(mean) else FARTHEST**2 * self._unit**2
-
     def loss(self, target: Sequence[int], chosen: Sequence[int], positive: Collection[int] = ()) -> Loss:
         """Return what a fit of columns leaves of the sum of others; gains in `positive` are not negative."""
         errors = np.zeros(self._records.size)
         for division in self._divisions:
-            places, left = division.left(target, chosen, positive)
-            errors[places] = left
+            left, judged = division.left(target, chosen, positive), division.place >= 0
+            errors[division.place[judged]] = left[judged]
         # A form far from the data may have errors beyond all bounds.
         errors = np.clip(np.nan_to_num(errors, nan=FARTHEST), -FARTHEST, FARTHEST)
         return Loss(errors * self._unit, self._samples, self._records, self._count)
@@ -234,14 +164,6 @@ def solved(
             break
         kept = np.delete(kept, min(bad, key=lambda k: float(found[k])))
     return gains
-
-
-def _stack_solved(matrices: FloatArray, vectors: FloatArray) -> FloatArray:
-    """Return the solutions, shape (n, k), of normal equations of shape (n, k, k) and (n, k)."""
-    try:
-        return np.asarray(np.linalg.solve(matrices, vectors[:, :, None])[:, :, 0])
-    except np.linalg.LinAlgError:
-        return np.array([_solved(*each) for each in zip(matrices, vectors, strict=True)])
 
 
 def _solved(matrix: FloatArray, vector: FloatArray) -> FloatArray:

@@ -139,20 +139,12 @@ class Equations:
                 own = held[record] & ~np.any([each for k, each in enumerate(held) if k != record], axis=0)
             rest[own], rest[:, own] = 0.0, 0.0
             sizes = [parts[group].shape[0] for group in groups]
+            fold = np.repeat([group % each if record >= 0 else 0 for group in groups], sizes)
             places = np.concatenate([place[group] for group in groups])
-            fold = np.repeat([group % each if record >= 0 else 1 for group in groups], sizes)
-            fold[places < 0] = 0
             # What the others cannot predict of a record says nothing of its zero, nor of its drift.
             ends = [slice(self._ends[group], self._ends[group + 1]) for group in groups]
             known = np.concatenate([self.predictable[self._samples[rows]] | (record < 0) for rows in ends])
-            rows = np.flatnonzero(known)[np.argsort(fold[known], kind="stable")]
-            errors = np.ones((rows.size, at.shape[1] + 1), order="F")
-            errors[:, :-1] = missed[rows]
-            if record >= 0 and rows.size:
-                # Its zero is fitted anyway; far off, it would drown the errors in products.
-                errors[:, :-1] -= errors[:, :-1].mean(axis=0)
-            last = tuple(np.searchsorted(fold[rows], range(1, each + 1 if record >= 0 else 3)).tolist())
-            divisions.append(Division(errors, last, rest, size, places[rows], own, record < 0))
+            divisions.append(Division(np.asfortranarray(missed[known]), rest, size, places[known], fold[known], own))
         total = inner - whole.T @ _solved(self.factor, whole)
         return HeldOut(divisions, total, samples, records, len(held), self.problem.scale)
 

@@ -70,7 +70,7 @@ class Part:
     v: FloatArray  # V, as commanded or read
     y: FloatArray  # m
     used: Mask  # in the fit; outliers, drop-outs and an unknown start only drive the hysteresis
-    seen: Mask  # valid displacement within the selected time
+    seen: Mask  # valid displacement within the selected time, without outliers and mixed readings
     after_reset: Mask  # both ends of the voltage range visited: `history` only adds a constant
     history: tuple[float, ...]  # V, as in `slpi_ros.model.axis_model.Start`
     others: Mapping[str, FloatArray]  # m, of the other axes from the start of the record

@@ -123,6 +123,7 @@ class Choice:
     removed: frozenset[str]
     forms: tuple[Form, ...]
     square: float  # m^2, mean
+    blocks: FloatArray  # m^2, sums over blocks
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -181,12 +182,9 @@ class Library:
         """Return a set with what is left to first order, one and the same for the same set."""
         key = removed, frozenset(forms)
         if key not in self._known:
-            self._known[key] = Choice(removed, forms, self.held_out.square(*self.columns(removed, forms)))
+            loss = self.held_out.loss(*self.columns(removed, forms))
+            self._known[key] = Choice(removed, forms, loss.square, loss.blocks)
         return self._known[key]
-
-    def blocks(self, choice: Choice) -> FloatArray:
-        """Return the sums of squares over blocks, m^2, of what is left to first order."""
-        return self.held_out.loss(*self.columns(choice.removed, choice.forms)).blocks
 
     def ban(self, forms: Sequence[Form]) -> None:
         """Leave out forms that have shown to mean nothing."""
@@ -198,13 +196,15 @@ class Library:
         target, chosen, _ = self.columns(removed, taken)
         whole = self.held_out.whole
         vector = whole[:, target].sum(axis=1)
-        inner = whole[np.ix_(chosen, chosen)]
-        size = np.sqrt(np.maximum(np.diag(inner), 1e-300))
-        scaled = inner / np.outer(size, size) + RIDGE * np.eye(size.size)
-        beside = whole[chosen] / size[:, None]
-        fitted = np.linalg.lstsq(scaled, np.column_stack([beside, vector[chosen] / size]), rcond=RIDGE)[0]
-        vector = vector - beside.T @ fitted[:, -1]
-        size = np.sqrt(np.maximum(np.diag(whole), 1e-300))
+        if chosen:
+            inner = whole[np.ix_(chosen, chosen)]
+            size = np.sqrt(np.maximum(np.diag(inner), 1e-300))
+            scaled = inner / np.outer(size, size) + RIDGE * np.eye(size.size)
+            beside = whole[chosen] / size[:, None]
+            solution = np.linalg.lstsq(scaled, np.column_stack([beside, vector[chosen] / size]), rcond=RIDGE)[0]
+            vector = vector - beside.T @ solution[:, -1]
+            whole = whole - beside.T @ solution[:, :-1]
+        size = np.sqrt(np.maximum(np.diag(self.held_out.whole), 1e-300))
         left_out = {*once, *(form.name for form in taken)}
         gains: dict[Form, float] = {}
         # Many small systems, those of one size at once.
@@ -214,8 +214,7 @@ class Library:
                 of_size.setdefault(form.numbers, []).append(form)
         for numbers, forms in of_size.items():
             at = np.array([form.first for form in forms])[:, None] + np.arange(numbers)
-            own = whole[at[:, :, None], at[:, None, :]] - np.einsum("kfi,kfj->fij", beside[:, at], fitted[:, at])
-            own /= size[at][:, :, None] * size[at][:, None, :]
+            own = whole[at[:, :, None], at[:, None, :]] / (size[at][:, :, None] * size[at][:, None, :])
             wanted = vector[at] / size[at]
             solution = np.linalg.solve(own + 1e-6 * np.eye(numbers), wanted[:, :, None])[:, :, 0]
             gains.update(zip(forms, np.sum(wanted * solution, axis=1).tolist(), strict=True))
@@ -325,7 +324,7 @@ class Search:
         """Return the best one of the sets in reach that are worth fitting, or `now`."""
         library, best = Library(now, self.names), now
         choices = library.choices(self.fixed)
-        self.trials = max(self.trials, independent_trials(now.held_out.blocks, [*map(library.blocks, choices)]))
+        self.trials = max(self.trials, independent_trials(now.held_out.blocks, [one.blocks for one in choices]))
         tried = set[Choice]()
         for _ in range(MOST_TRIED):
             choice = next((one for one in _worth_fitting(choices, now) if one not in tried), None)

@@ -1,4 +1,4 @@
-"""The devices by name. A new one is its own file with a class `DEVICE`, and an entry here."""
+"""The devices by name. A new one is its own file, which names its class in `DEVICE`, and an entry here."""
 
 from collections.abc import Sequence
 from importlib import import_module

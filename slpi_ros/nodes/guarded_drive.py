@@ -32,11 +32,11 @@ OnState = Callable[[bytes, int, Sequence[float]], None]
 class GuardedDrive:
     """Drive a stage within its limits, alone, from where it is, and only while it does what it is commanded.
 
-    Every voltage passes `move`, the last place before it is published, which keeps the limits by the steady clock; it
-    is called at the rate of the validated parameters `values`, which hold axes and limits as well; `state_timeout` is
-    the longest time without a valid state during a drive. `on_state` is called with each serialized state, its time
-    on the clock of the node, and its displacements (m), none if it is not valid. The name of the node begins messages
-    of errors.
+    Every voltage passes `move`, the last place before it is published, which keeps the limits by the steady clock (a
+    trajectory for a driver is checked whole); it is called at the rate of the validated parameters `values`, which hold
+    axes and limits as well; `state_timeout` is the longest time without a valid state during a drive. `on_state` is
+    called with each serialized state, its time on the clock of the node, and its displacements (m), none if it is not
+    valid. The name of the node begins messages of errors.
     """
 
     def __init__(self, node: Node, values: Values, on_state: OnState | None = None, publisher: Any = None) -> None:

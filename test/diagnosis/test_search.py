@@ -1,7 +1,5 @@
 """The search over sets of effects, and the choice of the answer, on short records of a stage."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from scipy.signal import lfilter, lfilter_zi
@@ -106,17 +104,6 @@ def test_a_delay_is_judged_in_the_place_of_a_lag(both):
     assert "delay" in {rival.name for rival in lag.rivals}
     assert all(rival.loss.rms > answer.now.held_out.rms for rival in lag.rivals)
     assert not lag.alternatives
-
-
-@pytest.mark.parametrize("zero", [0.0, 0.1])
-def test_the_mean_square_of_a_set_is_that_of_its_errors(zero):
-    now = fit(0.003, hum=2e-8, records=3)
-    parts = [replace(part, y=part.y + k * zero) for k, part in enumerate(now.evidence.parts)]
-    library = Library(JointFit(replace(now.evidence, parts=tuple(parts))), ("lag", "hum"))
-    for forms in ((), library.forms[:1], library.forms[-1:], (library.forms[0], library.forms[-1])):
-        columns = library.columns(frozenset(), forms)
-        loss = library.held_out.loss(*columns)
-        assert library.held_out.square(*columns) == pytest.approx(loss.square, rel=1e-9)
 
 
 def test_sets_are_compared_to_first_order_as_after_a_refit():

@@ -59,15 +59,21 @@ def abandoned_in(partial: Path) -> Path | None:
     return bag if is_one and not is_being_written(partial) else None
 
 
+def unused(path: Path) -> Path:
+    """Return the path of a bag, with a number behind it if there is one of this name, complete or not."""
+    number, free = 1, path
+    while free.exists() or partial_path(free).exists():
+        number, free = number + 1, path.with_name(f"{path.name}_{number}")
+    return free
+
+
 def set_aside(folder: Path, mark: str) -> None:
     """Rename the bags that killed recorders left in a folder: `mark` and the old name, by which they are read."""
     for partial in sorted(folder.glob(partial_path(folder / "*").name)):
         name = partial.name[1:].removesuffix(".partial")
         if name.startswith(mark) or not partial.is_dir() or is_being_written(partial):
             continue
-        number, aside = 1, folder / f"{mark}{name}"
-        while aside.exists() or partial_path(aside).exists():
-            number, aside = number + 1, folder / f"{mark}{name}_{number}"
+        aside = unused(folder / f"{mark}{name}")
         # First the bag: interrupted here, the second call completes it.
         if (partial / name).is_dir():
             (partial / name).rename(partial / aside.name)

@@ -22,7 +22,7 @@ from slpi_ros.io.bag_writer import BagWriter
 from slpi_ros.io.desired import read_path
 from slpi_ros.io.messages import JointStateEncoder
 from slpi_ros.io.stage_name import same_stage
-from slpi_ros.io.unfinished_bags import set_aside
+from slpi_ros.io.unfinished_bags import set_aside, unused
 from slpi_ros.model.limits import volts
 from slpi_ros.nodes import parameters as declare
 from slpi_ros.nodes.calibration_job import PATH, STATE, CalibrationJob, CalibrationOutcome, Wanted, stage_of_kept
@@ -149,7 +149,7 @@ class _Job:
                 raise RecordError(f"calibrator: no {STATE} during {self.wanted.name}")
             self._bag.close()
             if interrupted:
-                path.rename(_free(path.with_name(f"interrupted_{path.name}")))
+                path.rename(unused(path.with_name(f"interrupted_{path.name}")))
         except (OSError, RecordError) as error:
             self._fail(RecordError(str(error)))
 
@@ -444,11 +444,3 @@ def _prepare(output: Path, *, resume: bool) -> None:
         set_aside(output, "killed_")
     except OSError as error:
         raise RecordError(f"{output}: {error.strerror}; choose another folder") from None
-
-
-def _free(path: Path) -> Path:
-    """Return the path, with a number behind it if it exists."""
-    number, free = 1, path
-    while free.exists():
-        number, free = number + 1, path.with_name(f"{path.name}_{number}")
-    return free

@@ -121,7 +121,8 @@ def test_the_slope_at_the_beginning_of_a_motion_is_the_true_one():
     v = np.concatenate([np.zeros(60), np.linspace(0.0, 50.0, 30) ** 2 / 50.0])
     slope, error, sign = surest_slope(v, -1e-7 * v, FOLLOWING)
     assert slope == pytest.approx(1e-7) and sign == -1.0 and error < 1e-3 * slope
-    for still in (0.0, -7.1168e-6, 1.7e-5, 3.3e-3):
+    assert surest_slope(v, np.zeros(v.size), FOLLOWING)[0] == 0.0
+    for still in (-7.1168e-6, 1.7e-5, 3.3e-3):
         slope, error, _ = surest_slope(v, np.full(v.size, still), FOLLOWING)
         assert slope <= error
 

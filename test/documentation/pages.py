@@ -52,7 +52,7 @@ class Reader:
             (tools / name).chmod(0o755)
         self.environment = os.environ | {"PATH": f"{tools}:{PROGRAMS}:{os.environ['PATH']}"}
 
-    def type(self, text, patience=PATIENCE_S, codes=(0,)):
+    def type(self, text, patience=PATIENCE_S):
         """Type a block: wait for its end, unless its program runs until it is interrupted."""
         name = self.lasting(text)
         log = self.folder / f"{name or 'last'}.log"
@@ -69,7 +69,7 @@ class Reader:
         finally:
             if process.poll() is None:
                 os.killpg(process.pid, signal.SIGKILL)
-        assert code in codes, (text, code, log.read_text())
+        assert code == 0, (text, code, log.read_text())
         return ""
 
     @staticmethod

@@ -9,8 +9,6 @@ pytest.importorskip("rclpy")
 
 from documentation.pages import README, Reader, commands_of  # noqa: E402
 
-# These two end with 1 if the error is too large, which it may be on a busy computer.
-JUDGES = ("calibrator", "slpi verify")
 # Run here, in this order, and in test/nodes/test_readme_steps.py.
 SELF_CALIBRATED = ["stage_simulator", "calibrator", "slpi show", "slpi verify", "slpi diagnose", "slpi refit"]
 BY_HAND = ["stage_simulator", "recorder", "exciter", "slpi identify", "compensator", "ros2 topic pub"]
@@ -73,8 +71,7 @@ def test_a_stage_calibrates_itself_and_is_verified_diagnosed_and_refitted(tmp_pa
                 # The record of a verification stands for that of the next week.
                 last = max(path for path in (tmp_path / "my_stage").iterdir() if "verif" in path.name)
                 shutil.copytree(last, tmp_path / "today")
-            codes = (0, 1) if words in JUDGES else (0,)
-            reader.type(f"{command(words)} {FASTER.get(words, '')}", patience=1800.0, codes=codes)
+            reader.type(f"{command(words)} {FASTER.get(words, '')}", patience=1800.0)
         reader.check_alive()
     finally:
         reader.close()

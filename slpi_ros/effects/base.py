@@ -286,7 +286,7 @@ class Effect(ABC):
 
     @property
     def courses(self) -> tuple[tuple[float, ...], ...]:
-        """Values at the knots of an effect with a free course, record by record; else none."""
+        """Values at the knots of an effect with a free course, record by record, from one origin; else none."""
         return ()
 
     def in_phase(self, context: "FitContext") -> bool:
@@ -570,12 +570,14 @@ def decays(time_constants: Sequence[float], around: EffectContext) -> FloatArray
 def is_course(*records: Sequence[float]) -> bool:
     """Return whether the values at knots are those of a slow change that the knots resolve, not up and down by turns.
 
-    Von Neumann's ratio of the mean square of successive differences to twice the variance: 1 for independent values; of
-    all records together, as in some nothing may change.
+    Von Neumann's ratio of the mean square of successive differences within a record to twice the variance: 1 for
+    independent values; of all records together, as in some nothing may change, and between two of them much.
     """
     values = [np.asarray(knots) for knots in records if len(knots) >= FEWEST_KNOTS]
-    turns = sum(float(np.sum(np.diff(own) ** 2)) for own in values)
-    return turns <= 2.0 * LARGEST_RATIO * sum(float(np.sum((own - own.mean()) ** 2)) for own in values)
+    if not values:
+        return True
+    turns, together = sum(float(np.sum(np.diff(own) ** 2)) for own in values), np.concatenate(values)
+    return turns <= 2.0 * LARGEST_RATIO * float(np.sum((together - together.mean()) ** 2))
 
 
 def wave(phase: FloatArray) -> FloatArray:

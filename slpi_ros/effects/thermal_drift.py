@@ -59,8 +59,8 @@ class ThermalDrift(Additive):
 
     @property
     def courses(self) -> tuple[tuple[float, ...], ...]:
-        """Displacements at the knots, m."""
-        return (self.values,)
+        """Displacements at the knots, m, from their mean: a constant belongs to the zero."""
+        return (tuple((np.array(self.values) - np.mean(self.values)).tolist()),)
 
     def free_leaves(self) -> list[Leaf]:
         """Return the displacements at the knots but the last one: a constant belongs to the zero."""

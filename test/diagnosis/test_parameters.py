@@ -9,6 +9,7 @@ from hypothesis import given
 
 from slpi_ros.diagnosis.effect_parameters import LEAST_KNOWN, EachRecord, bounded, certain, free, moved, names, steps
 from slpi_ros.effects.base import is_course
+from slpi_ros.effects.gain_drift import GainDrift
 from slpi_ros.effects.parameters import facts_of
 from slpi_ros.effects.rate_dependence import RateDependence
 from slpi_ros.effects.registry import EFFECTS
@@ -70,3 +71,13 @@ def test_a_course_is_that_of_all_records_together(first, expected):
     times = (0.0, 10.0, 20.0, 30.0, 40.0)
     both = EachRecord((ThermalDrift(times, slow), ThermalDrift(times, noise)))
     assert is_course(*both.courses) is expected
+
+
+def test_what_differs_between_records_is_a_course_of_the_sensitivity_and_not_of_the_zero():
+    noise = np.array([1.0, -1.0, 1.0, -1.0, 1.0])
+    times = (10.0, 20.0, 30.0, 40.0, 50.0)
+    levels = [tuple((1e-3 * level + 1e-4 * noise).tolist()) for level in range(4)]
+    assert is_course(*EachRecord(tuple(GainDrift(times, gains, 0.0) for gains in levels)).courses)
+    assert not is_course(*EachRecord(tuple(ThermalDrift(times, values) for values in levels)).courses)
+    # Records that are all alike.
+    assert not is_course(*EachRecord(tuple(GainDrift(times, levels[0], 0.0) for _ in levels)).courses)

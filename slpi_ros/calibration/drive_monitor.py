@@ -1,7 +1,7 @@
 """What a stage reports during a drive, held against the voltages that it is commanded, without a model of the stage."""
 
 from collections.abc import Sequence
-from math import isfinite
+from math import isfinite, isnan
 
 from slpi_ros.calibration.drive_rules import RelationRule, StampRule, StateRule
 from slpi_ros.compensator.amplifier import Amplifier, VoltageLimits
@@ -80,6 +80,8 @@ class DriveMonitor:
     def refusal(self, v: Sequence[float], y: Sequence[float]) -> str:
         """Return which rule a state breaks, voltages `v` (V) and displacements `y` (m), with value and limit; or ""."""
         for axis, voltage, reading in zip(self._axes, v, y, strict=True):
+            if isnan(voltage) and isnan(reading):
+                return f"neither effort nor position of axis '{axis}'; name the axes as stage_state does"
             if not isfinite(voltage):
                 return f"effort of axis '{axis}' is {voltage:g}; report its voltage in volts"
             if not isfinite(reading):

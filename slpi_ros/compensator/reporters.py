@@ -5,7 +5,7 @@ from itertools import combinations
 
 from slpi_ros.compensator.monitor import Finding, Rule
 from slpi_ros.io.messages import SECOND_NS
-from slpi_ros.io.stage_name import same_stage
+from slpi_ros.io.stage_name import same_stage, stage_name
 
 # A report counts for this time after the last one of its kind: of another stage, or of a second publisher.
 STANDS_NS = 2 * SECOND_NS
@@ -41,6 +41,15 @@ class WhoseStage(Rule):
             if not same_stage(name, other, self.accepted):
                 return f"{what} stage '{name}', {other_what} '{other}'"
         return ""
+
+    @property
+    def doubt(self) -> str:
+        """Why a model in use may be that of another stage, though no two names differ; "" if it is not."""
+        model, reported = stage_name(self.model), stage_name(self.reported)
+        if bool(model) == bool(reported):
+            return ""
+        unnamed, named = ("model", reported) if reported else ("stage_state", model)
+        return f"the {unnamed} names no stage, so that nothing shows whether it is of stage '{named}'"
 
     def check(self, now_ns: int) -> Finding | None:
         """Return that the stage that reports now, or lately did, is another one."""

@@ -341,8 +341,10 @@ class Compensator(LifecycleNode):
         self._memory.poll()
 
     def _remark_start(self) -> None:
-        """Log what is not certain about voltages and memory where the output begins."""
+        """Log what is not certain about stage, voltages and memory where the output begins."""
         ownership = self._controller.ownership
+        if all(axis.model for axis in self._controller.axes):
+            self._reporter.log.remark("stage", ownership.stage.doubt)
         for axis in self._controller.axes:
             if not ownership.obstacle and (note := ownership.notes.get(axis.name)):
                 self._reporter.log.remark(f"{axis.name} start", f"axis '{axis.name}': {note}")

@@ -71,6 +71,7 @@ def watch_of(**given):
         (20.0, 12.3, ("position 12.3", "'x'", "0.1 m", "micrometres")),
         (20.0, float("nan"), ("position", "'x'", "nan")),
         (float("nan"), 1e-6, ("effort", "'x'", "nan")),
+        (float("nan"), float("nan"), ("neither effort nor position", "'x'")),
     ],
 )
 def test_the_rule_that_a_state_breaks_is_named(v, y, words):

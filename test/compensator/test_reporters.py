@@ -38,6 +38,18 @@ def test_names_that_differ_are_told(expected, model, reported, accepted, differs
         assert sum(f"'{name}'" in found.reason for name in known) == 2
 
 
+@pytest.mark.parametrize(
+    ("model", "reported", "named"),
+    [("", "a", "'a'"), ("a", "", "'a'"), ("a", "base_link", "'a'"), ("", "", ""), ("a", "a", ""), ("", "map", "")],
+)
+def test_a_name_that_one_of_them_lacks_is_told(model, reported, named):
+    rule = WhoseStage()
+    rule.model = model
+    rule.hear(reported, 1)
+    assert bool(rule.doubt) is bool(named) and named in rule.doubt
+    assert rule.check(2) is None
+
+
 def test_another_stage_stands_for_a_while_though_the_own_one_reports_too():
     rule = WhoseStage()
     rule.model = "a"

@@ -22,11 +22,12 @@ class WhoseStage(Rule):
     def __init__(self, expected: str = "", accepted: str = "") -> None:
         self.expected, self.accepted, self.model = expected, accepted, ""
         self.reported = ""  # the last name
+        self._heard = False
         self._other: tuple[str, int] = "", 0  # name of another stage, and when it was reported last
 
     def hear(self, frame: str, now_ns: int) -> None:
         """Take the name of the stage in a report."""
-        self.reported = frame
+        self.reported, self._heard = frame, True
         if self.difference(reported=frame):
             self._other = frame, now_ns
 
@@ -44,9 +45,9 @@ class WhoseStage(Rule):
 
     @property
     def doubt(self) -> str:
-        """Why a model in use may be that of another stage, though no two names differ; "" if it is not."""
+        """Which name is missing to tell whether the model in use is of the stage that reports; "" if none is."""
         model, reported = stage_name(self.model), stage_name(self.reported)
-        if bool(model) == bool(reported):
+        if not self._heard or bool(model) == bool(reported):
             return ""
         unnamed, named = ("model", reported) if reported else ("stage_state", model)
         return f"the {unnamed} names no stage, so that nothing shows whether it is of stage '{named}'"

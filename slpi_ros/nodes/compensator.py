@@ -341,10 +341,8 @@ class Compensator(LifecycleNode):
         self._memory.poll()
 
     def _remark_start(self) -> None:
-        """Log what is not certain about stage, voltages and memory where the output begins."""
+        """Log what is not certain about voltages and memory where the output begins."""
         ownership = self._controller.ownership
-        if all(axis.model for axis in self._controller.axes):
-            self._reporter.log.remark("stage", ownership.stage.doubt)
         for axis in self._controller.axes:
             if not ownership.obstacle and (note := ownership.notes.get(axis.name)):
                 self._reporter.log.remark(f"{axis.name} start", f"axis '{axis.name}': {note}")
@@ -429,6 +427,8 @@ class Compensator(LifecycleNode):
             self._looked_ns = now_ns
             self._surroundings.update([topic for topic in values["surroundings"] if topic])
             reporter.quantities = controller.surroundings.problems(self._surroundings.refused, now_ns)
+            if all(axis.model for axis in controller.axes):
+                reporter.log.remark("stage", controller.ownership.stage.doubt)
         self._locate()
         for axis in controller.axes:
             found = axis.amplifier.calibration

@@ -45,6 +45,7 @@ def test_names_that_differ_are_told(expected, model, reported, accepted, differs
 def test_a_name_that_one_of_them_lacks_is_told(model, reported, named):
     rule = WhoseStage()
     rule.model = model
+    assert not rule.doubt  # nothing has reported yet
     rule.hear(reported, 1)
     assert bool(rule.doubt) is bool(named) and named in rule.doubt
     assert rule.check(2) is None

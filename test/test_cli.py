@@ -232,6 +232,19 @@ def test_an_import_tells_what_it_took_for_what(tmp_path):
     ]
 
 
+def test_a_thousandth_of_the_unit_is_told_before_anything_else(folder, tmp_path):
+    record = slpi_ros.read_bag(folder / "bag")
+    rows = np.column_stack([record.t, record.voltage["x"], 1e6 * record.displacement["x"]])
+    for unit, told in (("um", ""), ("nm", "check the columns and their units")):
+        np.savetxt(tmp_path / "d.csv", rows, delimiter=",", header=f"time_s,x_V,x_{unit}", comments="", fmt="%.12g")
+        done = slpi("import", tmp_path / "d.csv", "-o", tmp_path / unit)
+        assert done.returncode == 0 and told in done.stderr and bool(told) == bool(done.stderr)
+    model = ("--model", folder / "pi.json")
+    last = slpi("verify", tmp_path / "nm", *model).stdout.splitlines()[-1]
+    assert last == f"next: slpi doctor {tmp_path / 'nm'} --model {folder / 'pi.json'}"
+    assert "check the unit" in slpi("doctor", tmp_path / "nm", *model, "--no-ros").stdout.splitlines()[-1]
+
+
 def test_a_table_is_named_once_in_a_message(folder, tmp_path):
     path = another_axis(folder, tmp_path)[0][2]
     for command, suffix in (("compensate", "m"), ("simulate", "V")):

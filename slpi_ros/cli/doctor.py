@@ -74,18 +74,20 @@ def run(options: Namespace) -> Result:
     if not 0.0 < options.seconds <= LONGEST_WATCH:
         raise UsageError(f"--seconds {options.seconds:g}: give a time of up to {LONGEST_WATCH:g} s")
     checks, model, files = [], None, [*options.bags, *filter(None, [options.model])]
+    of_model = []
     if options.model:
         try:
             model = load_model(options.model)
-            checks += report.check_model(model, limits)
+            of_model = report.check_model(model, limits)
         except SlpiError as error:
-            checks.append(report.Check(report.FAILED, str(error)))
+            of_model = [report.Check(report.FAILED, str(error))]
     for bag in options.bags:
         report_progress(f"reading {bag}")
         try:
             checks += report.check_record(read_bag(bag, options.topic), model, limits)
         except SlpiError as error:
             checks.append(report.Check(report.FAILED, str(error)))
+    checks += of_model
     table: list[str] = []
     if options.device:
         told, table = _read_device(options.device, options.channels)

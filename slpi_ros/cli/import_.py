@@ -70,6 +70,7 @@ def add_options(command: ArgumentParser) -> None:
 
 def run(options: Namespace) -> Result:
     """Run the command."""
+    from slpi_ros.compensator.plausible import implausible
     from slpi_ros.io.bag_writer import write_bag
     from slpi_ros.io.columns import ColumnOptions
     from slpi_ros.io.outputs import allow_bag
@@ -79,6 +80,10 @@ def run(options: Namespace) -> Result:
     options.remarks += allow_bag(options.output, overwrite=options.overwrite)
     table = import_with_summary(options.table, columns)
     record = replace(table.record, hardware_id=options.hardware_id)
+    for axis, y in record.displacement.items():
+        if wrong := implausible(record.voltage[axis], y):
+            wrong += ", which no piezo stage has; check the columns and their units"
+            options.remarks.append(f"axis '{axis}': {wrong}")
     # What a link leads to is replaced, not the link.
     place = os.path.realpath(options.output) if options.overwrite else options.output
     write_bag(place, record, storage=options.storage, replace=options.overwrite, desired=table.desired)

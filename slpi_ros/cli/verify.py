@@ -6,7 +6,7 @@ from argparse import ArgumentParser, Namespace
 from contextlib import nullcontext
 
 from slpi_ros.cli import options as common
-from slpi_ros.cli.command import Result
+from slpi_ros.cli.command import Result, command_line
 from slpi_ros.errors import UsageError
 
 HELP = "test a model on bags not used to identify it: passed, failed or unproved"
@@ -89,6 +89,9 @@ def run(options: Namespace) -> Result:
         next_command = f"slpi compensate {shlex.quote(options.model)} DESIRED.csv -o VOLTAGE.csv"
     elif found.verdict == UNPROVED and not any(done.independent):
         next_command = f"slpi verify OTHER_BAG --model {shlex.quote(options.model)}"
+    elif any(record.foreign for axis in found.axes.values() for record in axis.records):
+        # A cause that a model lacks never halves or doubles its loops.
+        next_command = command_line("slpi", "doctor", *options.bags, "--model", options.model)
     else:
         next_command = common.diagnosis_of(options, options.model)
     return Result(

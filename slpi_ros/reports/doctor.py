@@ -80,13 +80,14 @@ def check_record(record: Record, model: StageModel | None = None, limits: Range 
 
 def _of_record(record: Record, model: StageModel | None, limits: Range | None) -> Iterator[Check]:
     for axis in record.axes:
-        for finding in findings(assess(record, axis)):
-            yield Check(OK if finding.level == "ok" else FAILED, f"axis {axis}: {finding.text}")
         v = record.voltage[axis]
-        reached = float(np.nanmin(v)), float(np.nanmax(v))
+        # First, as nothing else of a record in wrong units means what it says.
         units = implausible(v, record.displacement[axis], limits[1] - limits[0] if limits else nan)
         if units:
             yield Check(FAILED, f"axis {axis}: {units}, {NO_STAGE}")
+        for finding in findings(assess(record, axis)):
+            yield Check(OK if finding.level == "ok" else FAILED, f"axis {axis}: {finding.text}")
+        reached = float(np.nanmin(v)), float(np.nanmax(v))
         if limits is not None:
             yield _within(axis, "the voltage went", reached, limits, "the limits", "correct the limits or the driver")
         if model is not None and axis in model.axes:

@@ -42,7 +42,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test test-long test-properties test-jazzy test-newest test-kilted test-minimum test-environment demo bench bench-robustness bench-diagnosis bench-records bench-next-record bench-start-memory bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-twins bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-recorder bench-oscillation bench-tune bench-export bench-coverage bench-identification bench-diagnosis-speed test-export-arm bench-company FORCE
+.PHONY: help build test test-long test-properties test-jazzy test-newest test-kilted test-minimum test-environment demo bench bench-robustness bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-twins bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-oscillation bench-tune bench-export bench-coverage bench-identification bench-diagnosis-speed test-export-arm bench-company FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -60,10 +60,6 @@ help:
 	@echo 'make bench-identification  time, memory and results of identifications beside another commit; BESIDE=built clone'
 	@echo 'make bench-diagnosis-speed  time and memory of diagnoses beside another commit, 5 minutes; BESIDE=built clone'
 	@echo 'make bench-robustness  spoiled records beside clean ones, 8 seeds, 2 minutes'
-	@echo 'make bench-diagnosis   hidden effects: named, missed, invented; about an hour'
-	@echo 'make bench-records     what is found on some measured records, judged on others; half an hour'
-	@echo 'make bench-next-record   an advised second record, and pairs judged on a third; an hour or two'
-	@echo 'make bench-start-memory  100 memories at the start of a record: is a change told where there is one only'
 	@echo 'make bench-latency  round trip through the compensator beside a bare echo node, 4 minutes'
 	@echo 'make bench-driver    cycles of the driver with simulated devices: rate, lateness, processor, two minutes'
 	@echo 'make bench-device-faults  faults of simulated devices: what moves, how long a call waits, when it is told, 4 minutes'
@@ -82,7 +78,6 @@ help:
 	@echo 'make audit      known vulnerabilities of the pinned dependencies, by pip-audit'
 	@echo 'make bench-learning  paths that repeat on stages of other physics, beside feedback and another learning; 20 minutes; LEARNING="--count 40 --all-paths"'
 	@echo 'make bench-loop-rate  crossover of the closed loop with 10, 100 and 1,000 commands a second, two minutes'
-	@echo 'make bench-recorder  processor time of the recorder at 2 kHz, and what it loses when it is killed, 3 minutes; RECORDER="--beside PYTHON"'
 	@echo 'make bench-tune     30 stages identified and tuned automatically: bandwidth, margin, detuned modes, a raster; half an hour'
 	@echo 'make bench-oscillation  feedback that oscillates and feedback that is well tuned: what is switched off, and when; six minutes'
 	@echo 'make bench-lies     eight kinds of faulty sensors, and sound ones: time driven, false alarms; ten minutes'
@@ -93,7 +88,7 @@ help:
 	@echo 'make bench-twins       the methods of bench-measured beside second implementations; half an hour'
 	@echo 'make bench-agreement  200 hostile bags: command line, identify node and fleet decide the same; 3 minutes'
 	@echo 'make bench-confusion   effects, pairs, clean stages and causes that no effect describes: wrong or silent; an hour'
-	@echo 'make bench-calibrator  the calibrator on 20 hidden stages, and 30 faults; an hour'
+	@echo 'make bench-calibrator  calibrations over DDS that meet a fault: limits, rest at the end, what is kept; 20 minutes'
 	@echo 'make bench-promise     the error that the calibrator promises on 20 stages, and that of scans later; half an hour'
 	@echo 'make bench-coverage   true errors within two standard uncertainties, and how large these are, by horizon; COVERAGE="--stages 100"; 20 minutes'
 	@echo 'make bench-fleet    300 bags of 30 stages on Dask: changes found, one worker beside two, 20 minutes'
@@ -164,18 +159,6 @@ bench-diagnosis-speed: build
 bench-robustness: build
 	$(VENV) benchmarks/robustness.py
 
-bench-diagnosis: build
-	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/diagnosis.py
-
-bench-records: build
-	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/records.py
-
-bench-next-record: build
-	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/next_record.py
-
-bench-start-memory: build
-	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/start_memory.py
-
 # All environments on one record, say RECORD=afm_double_sine_x.csv
 PLATFORMS := jazzy newest kilted
 bench-platforms: build
@@ -187,9 +170,6 @@ bench-latency: build
 
 bench-loop-rate: build
 	$(IN_OWN_DOMAIN) $(VENV) benchmarks/loop_rate.py
-
-bench-recorder: build
-	$(IN_OWN_DOMAIN) $(VENV) benchmarks/recorder.py $(RECORDER)
 
 bench-oscillation: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) -m benchmarks.oscillation
@@ -264,7 +244,7 @@ bench-agreement: build
 	$(IN_WORKSPACE) PYTHONPATH=.:test OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/agreement.py
 
 bench-calibrator: build
-	$(IN_OWN_DOMAIN) env OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/calibrator.py
+	$(IN_OWN_DOMAIN) $(VENV) benchmarks/calibrator_faults.py
 
 bench-confusion: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/confusion.py

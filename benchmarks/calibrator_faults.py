@@ -1,5 +1,6 @@
 """Calibrations over DDS that meet a fault at a random moment: is the stage safe, and what was recorded kept."""
 
+import argparse
 import os
 import signal
 import subprocess
@@ -102,3 +103,9 @@ def faults(count: int) -> None:
         print(f"{kind:20} {'; '.join(wrong) or 'safe':24} {last}", flush=True)
     print(f"\n{good} of {count} faults: within limits and slew limit, at rest at the end, what was recorded is kept")
     rclpy.shutdown()
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--faults", type=int, default=30, help="calibrations with a fault")
+    faults(parser.parse_args().faults)

@@ -14,7 +14,11 @@ import os
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import argparse
+import contextlib
+import io
 import json
+import re
+import shlex
 import tempfile
 import time
 from collections import Counter, defaultdict
@@ -30,14 +34,15 @@ import numpy as np
 from hidden import CONFUSABLE, NAMES, again, hide
 from hidden.unknown import KINDS, NEAR, hide_unknown
 from identification_speed import run as run_clone
-from next_record import advised_drive
 from numpy.typing import NDArray
 from scipy.stats import beta
 
 import slpi_ros
+from slpi_ros.cli import main as slpi
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.io.bag_writer import write_bag
 from slpi_ros.io.record import Record
+from slpi_ros.io.tables import read_table
 from slpi_ros.simulation.axis import SimulatedAxis
 from slpi_ros.simulation.character import Character
 from slpi_ros.simulation.parameters import AxisParameters
@@ -233,6 +238,23 @@ class Drawn:
         own = voltage.get(self.axis, next(iter(voltage.values())))
         rest = {axis: np.full(t.size, self.record.voltage[axis].min()) for axis in others}
         return self.another(t, {**rest, **{axis: v for axis, v in voltage.items() if axis in others}, self.axis: own})
+
+
+def advised_drive(next_experiment: str, *options: str) -> tuple[str, FloatArray, dict[str, FloatArray]]:
+    """Run the recommended command, with further options; return the effect that it is intended for, and its drive.
+
+    The drive is its times (s) and voltages (V) by axis, shape (N,) each; there are none where nothing is recommended.
+    """
+    command = re.search(r"`slpi (excite -o .*?)`", next_experiment)
+    if not command:
+        return "", np.empty(0), {}
+    words = shlex.split(command[1])
+    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(io.StringIO()):
+        table = Path(folder) / "drive.csv"
+        if slpi([*words, "-o", str(table), *options]):
+            return "", np.empty(0), {}
+        t, voltage = read_table(table, "V")
+    return words[words.index("--for") + 1] if "--for" in words else "calibration", t, voltage
 
 
 def _drawn(case: Case) -> Drawn:

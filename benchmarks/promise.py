@@ -1,6 +1,7 @@
 """The error that the calibrator promises, beside that of scans five minutes later: after a reset, and after a restart.
 
-Stage time and physics are those of `calibrator.py`, without ROS between them. All errors are measured - desired, with
+The decisions and the physics are those of the node and of the simulated stage, in stage time, without ROS between
+them. All errors are measured - desired, with
 the constant offset, after ~/set_zero. Run it with ``make bench-promise``.
 """
 
@@ -12,6 +13,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import argparse
 import sys
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from math import nan
 from multiprocessing import get_context
@@ -22,19 +24,61 @@ import numpy as np
 from numpy.typing import NDArray
 
 sys.path.append(str(Path(__file__).resolve().parents[1]))
-from calibrator import LIMITS, RATE, Bench, alike, hidden, settings_for
 
-from slpi_ros.calibration.run import Outcome, calibrate
+from slpi_ros.calibration.run import Outcome, Recording, Request, calibrate
+from slpi_ros.calibration.settings import CalibrationSettings
 from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.persistence import SavedAxis
 from slpi_ros.errors import SlpiError
+from slpi_ros.io.record import Record
+from slpi_ros.model.limits import Limits
+from slpi_ros.simulation.stage import Stage
 
+RATE, NOISE, BUDGET = 200.0, 8e-9, 300.0
+LIMITS = Limits(0.0, 100.0, 1000.0, 1e5)
+# The stage rests this long between two drives, while the calibration computes, seconds.
+PAUSE = 30.0
+# Alike from outside.
+ALIKE = {"delay", "lag"}
 # Time from the last record to the reset, and that without a compensator at a restart, seconds.
 LATER, RESTART = 300.0, 20.0
 # Reset as the compensator does it by default; legs of a scan and their durations (s); shares of the range.
 CYCLES, RESET_RATE, LEGS, SECONDS, INNER = 10, 200.0, 12, (1.0, 2.5), (0.05, 0.93)
 # The promise is kept within this factor.
 FACTOR = 1.5
+
+
+class Bench:
+    """A simulated stage in stage time, and the voltages that it was given."""
+
+    def __init__(self, stage: Stage) -> None:
+        self.stage, self.now = stage, 1000.0
+
+    def __call__(self, request: Request) -> Recording:
+        """Drive the stage and return the record."""
+        rows = np.column_stack(list(request.drive.voltage.values())).tolist()
+        t = (self.now + request.drive.t).tolist()
+        y = np.array([self.stage.measure(self.stage.step(at, row)) for at, row in zip(t, rows, strict=True)])
+        time_ns = np.round((self.now + request.drive.t) * 1e9).astype(np.int64)
+        self.now += float(request.drive.t[-1]) + PAUSE
+        displacement = dict(zip(request.drive.axes, y.T, strict=True))
+        return Recording(Record(time_ns, request.drive.voltage, displacement, request.name, "hidden"), request.desired)
+
+
+def hidden(axes: Sequence[str], seed: int) -> Stage:
+    """Return the stage of a seed, at rest."""
+    return Stage.hidden(axes, seed, NOISE, rate=RATE, voltage_max=LIMITS.upper)
+
+
+def settings_for(axes: Sequence[str]) -> CalibrationSettings:
+    """Return the settings of all calibrations."""
+    count = len(axes)
+    return CalibrationSettings(tuple(axes), (LIMITS,) * count, (0.0,) * count, RATE, BUDGET * count)
+
+
+def alike(names: Sequence[str]) -> set[str]:
+    """Return the names of effects, those that look alike from outside as one."""
+    return {"delay or lag" if name in ALIKE else name for name in names}
 
 
 class Operation:

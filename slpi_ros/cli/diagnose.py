@@ -45,7 +45,7 @@ def run(options: Namespace) -> Result:
     # The model is not checked: an extended model may be extended again.
     common.allow_folder(options, options.output, *report.FILES)
     with output_folder(options.output, *report.FILES) as folder:
-        done = diagnose(DiagnoseRequest(source, model))
+        done = diagnose(DiagnoseRequest(source, model, options.model))
         diagnosis = done.diagnosis
         report.write_files(folder, diagnosis)
     limits = report.diagnosis_limits(diagnosis)

@@ -87,11 +87,11 @@ class Judge:
         for fitted in sorted(self._search.pool.values(), key=lambda one: (one.numbers, one.loss.square)):
             if fitted.numbers >= EffectSet.of(now).numbers:
                 break
-            if not self._beats(best.held_out, fitted.loss):
+            if not self._beats(best, fitted):
                 fewer = self._rebuilt(fitted)
-                if self._beats(best.held_out, fewer.held_out) or self._senseless(fewer):
+                if self._beats(best, fewer) or self._senseless(fewer):
                     continue
-                if all(self._beats(fewer.held_out, self._without(fewer, name).held_out) for name in self._free(fewer)):
+                if all(self._beats(fewer, self._without(fewer, name)) for name in self._free(fewer)):
                     now = fewer
                     break
         now, rivals = self._exchanged(self._needed(now, best))
@@ -99,8 +99,10 @@ class Judge:
         named = self._named(now, rivals)
         return self._beside_structures(Answer(self._base, now, named))
 
-    def _beats(self, one: Loss, other: Loss) -> bool:
-        return beats(one, other, self._noise, self._search.trials)
+    def _beats(self, one: JointFit | EffectSet, other: JointFit | EffectSet) -> bool:
+        own, its = (EffectSet.of(each) if isinstance(each, JointFit) else each for each in (one, other))
+        contained = {*its.names} <= {*own.names}
+        return beats(own.loss, its.loss, self._noise, self._search.trials, contained=contained)
 
     def _rebuilt(self, fitted: EffectSet) -> JointFit:
         return JointFit(self._evidence, fitted.effects, self._base).refined(CONVERGED)
@@ -154,11 +156,11 @@ class Judge:
         while found := self._senseless(now):
             now = min((self._without(now, name) for name in found), key=lambda fit: fit.held_out.square)
         for fitted in sorted(self._search.pool.values(), key=lambda one: one.loss.square):
-            if not self._beats(fitted.loss, now.held_out):
+            if not self._beats(fitted, now):
                 break
             if self._may_make_sense(fitted):
                 other = self._rebuilt(fitted)
-                if self._beats(other.held_out, now.held_out) and not self._senseless(other):
+                if self._beats(other, now) and not self._senseless(other):
                     return other
         return now
 
@@ -176,7 +178,7 @@ class Judge:
         """Return a joint fit without the effects that it, or the best one, does not need."""
         while True:
             rest = [self._without(now, name) for name in self._free(now)]
-            spare = [one for one in rest if not all(self._beats(each.held_out, one.held_out) for each in (now, best))]
+            spare = [one for one in rest if not all(self._beats(each, one) for each in (now, best))]
             if not spare:
                 return now
             now = min(spare, key=lambda one: (EffectSet.of(one).numbers, one.held_out.square))
@@ -206,7 +208,7 @@ class Judge:
         # With the parameters beside the effect, which are not those without it.
         library = Library(now.only({other.name for other in now.effects} - {name}, refine=False), self._search.names)
         present = {other.name for other in rest.effects} | (set() if effect.keys else {name})
-        singles, most = library.screened((), (), present), inf if alone or unproved else free(effect).size
+        singles, most = library.screened(frozenset(), (), present), inf if alone or unproved else free(effect).size
         choices = sorted((library.choice(frozenset(), (form,)) for form in singles), key=lambda one: one.square)
         found, tried = list[tuple[str, JointFit]](), dict[str, int]()
         for choice in [one for one in choices if one.square < rest.held_out.square]:
@@ -224,7 +226,7 @@ class Judge:
         found.sort(key=lambda pair: pair[1].held_out.square)
         rivals, better, own = list[Rival](), list[JointFit](), EffectSet.of(now).numbers
         for label, fit in found:
-            as_good, numbers = not self._beats(now.held_out, fit.held_out), EffectSet.of(fit).numbers
+            as_good, numbers = not self._beats(now, fit), EffectSet.of(fit).numbers
             other = fit.effect(label.partition(" ")[0])
             fewer = numbers < own or (numbers == own and fit.held_out.square < now.held_out.square)
             if as_good and (unproved and other.courses or fewer and not (single and other.keys and effect.courses)):
@@ -232,7 +234,7 @@ class Judge:
             if numbers <= own or alone:
                 # What both leave where they differ says nothing of which one is the cause.
                 refuted = not as_good and share(now.held_out, fit.held_out, self._noise) >= EXPLAINED
-                as_good = not refuted or (alone and self._beats(fit.held_out, rest.held_out))
+                as_good = not refuted or (alone and self._beats(fit, rest))
                 rivals.append(Rival(label, fit.held_out, as_good))
         better.sort(key=lambda fit: (EffectSet.of(fit).numbers, fit.held_out.square))
         return next((fit for fit in better if not self._senseless(fit)), None), tuple(rivals)
@@ -262,7 +264,7 @@ class Judge:
                 return Answer(self._base, self._base, structures=(name,), dropped=dropped)
             with_it = now.beside(columns(now)).held_out
             explains = share(with_it, now.held_out, self._noise) >= EXPLAINED
-            if explains and self._beats(with_it, now.held_out):
+            if explains and beats(with_it, now.held_out, self._noise, self._search.trials):
                 found.append((with_it.square, name))
         return replace(answer, structures=(min(found)[1],)) if found else answer
 

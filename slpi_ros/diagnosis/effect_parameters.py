@@ -128,6 +128,17 @@ def steps(effect: Effect, t: FloatArray, v: FloatArray) -> FloatArray:
     return np.array(found)
 
 
+def independent(effect: Effect) -> list[dict[int, int | None]]:
+    """Return groups of free parameters of which no sample depends on two: record (None: all) by place in `free`."""
+    if not isinstance(effect, EachRecord):
+        return [{k: None} for k in range(free(effect).size)]
+    counts = [free(part).size for part in effect.parts]
+    firsts = np.cumsum([0, *counts]).tolist()
+    return [
+        {firsts[record] + k: record for record, count in enumerate(counts) if k < count} for k in range(max(counts))
+    ]
+
+
 def bounded(effect: Effect, change: FloatArray) -> FloatArray:
     """Return a change of the free parameters, limited to the range in which the linearised fit is valid."""
     limits = {"linear": np.inf, "angle": LARGEST_STEP, "logarithmic": LARGEST_LOG_STEP}

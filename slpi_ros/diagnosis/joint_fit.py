@@ -18,7 +18,7 @@ import numpy as np
 import scipy.linalg
 
 from slpi_ros.arrays import FloatArray, IntArray, Mask
-from slpi_ros.diagnosis.effect_parameters import bounded, certain, free, moved, steps
+from slpi_ros.diagnosis.effect_parameters import bounded, certain, free, independent, moved, steps
 from slpi_ros.diagnosis.held_out import Division, HeldOut, Loss, solved
 from slpi_ros.diagnosis.prepare import Evidence, Part
 from slpi_ros.diagnosis.ruler import alike_in_a_row
@@ -431,15 +431,20 @@ class JointFit:
     @cached_property
     def tangents(self) -> FloatArray:
         """Derivative of the prediction by each free parameter of the effects, shape (N, k), metres per unit."""
-        columns = []
+        found = [np.empty((self.evidence.t.size, 0))]
         for place, effect in enumerate(self.effects):
-            values = free(effect)
-            for k, step in enumerate(steps(effect, self.evidence.t, self.evidence.v)):
+            values, by = free(effect), steps(effect, self.evidence.t, self.evidence.v)
+            columns = np.zeros((self.evidence.t.size, values.size))
+            for group in independent(effect):
                 changed = values.copy()
-                changed[k] += step
+                changed[[*group]] += by[[*group]]
                 effects = [*self.effects[:place], moved(effect, changed), *self.effects[place + 1 :]]
-                columns.append((self._whole(effects) - self.predicted) / step)
-        return np.column_stack([np.empty((self.evidence.t.size, 0)), *columns])
+                change = self._whole(effects) - self.predicted
+                for k, record in group.items():
+                    rows = slice(None) if record is None else self.evidence.slices[record]
+                    columns[rows, k] = change[rows] / by[k]
+            found.append(columns)
+        return np.column_stack(found)
 
     def _whole(self, effects: Sequence[Effect]) -> FloatArray:
         """Return the prediction, shape (N,), metres, of the same hysteresis with other effects."""

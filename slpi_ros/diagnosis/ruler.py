@@ -25,14 +25,16 @@ SURROGATES, TAIL, SIGNED_BLOCKS = 1999, 0.05, 40
 LEAST_CHANCE = 1e-12
 
 
-def beats(one: Loss, other: Loss, noise: float, trials: float = 1.0) -> bool:
+def beats(one: Loss, other: Loss, noise: float, trials: float = 1.0, *, contained: bool = True) -> bool:
     """Return whether a joint fit predicts better than another one, by more than chance and `LEAST` of the noise (m).
 
-    And is clearly worse on no record that is left out.
+    And, where the other one is `contained` in it, is clearly worse on no record that is left out: what is added must
+    carry over. Of two different causes either may be the better one on some record.
     """
     own, its = one.beside(other)
     fall = float(np.mean(its**2) - np.mean(own**2))
-    return fall > (LEAST * noise) ** 2 and carries_over(one, other) and chance(one, other, trials) <= CHANCE
+    better = fall > (LEAST * noise) ** 2 and chance(one, other, trials) <= CHANCE
+    return better and (not contained or carries_over(one, other))
 
 
 def carries_over(one: Loss, other: Loss) -> bool:

@@ -158,6 +158,7 @@ class Library:
         self._size = np.where(size > 0.0, size, 1.0)
         self.held_out: HeldOut = now.equations.held_out(at / self._size)
         self._known: dict[tuple[frozenset[str], frozenset[Form]], Choice] = {}
+        self._screened: dict[tuple[frozenset[str], frozenset[Form]], dict[Form, float]] = {}
 
     def _candidates(self, names: Collection[str]) -> Iterator[tuple[str, Candidate | Effect, FloatArray]]:
         for name in names:
@@ -191,8 +192,19 @@ class Library:
         banned = {form.kind for form in forms}
         self.forms = [form for form in self.forms if form.kind not in banned]
 
-    def screened(self, removed: Collection[str], taken: Sequence[Form], once: Collection[str]) -> list[Form]:
+    def screened(self, removed: frozenset[str], taken: Sequence[Form], once: Collection[str]) -> list[Form]:
         """Return the forms that explain most of the fitted samples, the best of each group of each effect."""
+        key = removed, frozenset(taken)
+        if key not in self._screened:
+            self._screened[key] = self._explained(removed, taken)
+        gains, left_out = self._screened[key], {*once, *(form.name for form in taken)}
+        best: dict[tuple[str, int, int], Form] = {}
+        for form in sorted((one for one in self.forms if one.name not in left_out), key=lambda one: -gains[one]):
+            best.setdefault((*form.kind, form.numbers), form)
+        return [*best.values()]
+
+    def _explained(self, removed: Collection[str], taken: Sequence[Form]) -> dict[Form, float]:
+        """Return how much of the fitted samples each form explains beside those that are taken."""
         target, chosen, _ = self.columns(removed, taken)
         whole = self.held_out.whole
         vector = whole[:, target].sum(axis=1)
@@ -205,23 +217,18 @@ class Library:
             vector = vector - beside.T @ solution[:, -1]
             whole = whole - beside.T @ solution[:, :-1]
         size = np.sqrt(np.maximum(np.diag(self.held_out.whole), 1e-300))
-        left_out = {*once, *(form.name for form in taken)}
         gains: dict[Form, float] = {}
         # Many small systems, those of one size at once.
         of_size: dict[int, list[Form]] = {}
         for form in self.forms:
-            if form.name not in left_out:
-                of_size.setdefault(form.numbers, []).append(form)
+            of_size.setdefault(form.numbers, []).append(form)
         for numbers, forms in of_size.items():
             at = np.array([form.first for form in forms])[:, None] + np.arange(numbers)
             own = whole[at[:, :, None], at[:, None, :]] / (size[at][:, :, None] * size[at][:, None, :])
             wanted = vector[at] / size[at]
             solution = np.linalg.solve(own + 1e-6 * np.eye(numbers), wanted[:, :, None])[:, :, 0]
             gains.update(zip(forms, np.sum(wanted * solution, axis=1).tolist(), strict=True))
-        best: dict[tuple[str, int, int], Form] = {}
-        for form in sorted(gains, key=lambda form: -gains[form]):
-            best.setdefault((*form.kind, form.numbers), form)
-        return [*best.values()]
+        return gains
 
     def choices(self, fixed: Collection[str], screened: int = 12) -> list[Choice]:
         """Return sets in reach: forms added, to all effects and to all but one, the least error first."""

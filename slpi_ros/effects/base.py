@@ -4,7 +4,7 @@ import re
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from functools import partial, wraps
+from functools import cached_property, partial, wraps
 from math import inf
 from typing import Any, ClassVar, Literal, NamedTuple, Self, TypeVar
 
@@ -305,20 +305,21 @@ class Effect(ABC):
         """Return the effect with its state before the records, from the amplitudes (m) of the columns of `starting`."""
         return self
 
+    @cached_property
+    def leaves(self) -> tuple[Leaf, ...]:
+        """The numbers in all parameters."""
+        known = facts_of(type(self)).items()
+        return tuple(leaf for name, facts in known for leaf in leaves(name, facts, getattr(self, name)))
+
     def free_leaves(self) -> list[Leaf]:
         """Return the fitted numbers."""
-        every = (
-            leaf for name, facts in facts_of(type(self)).items() for leaf in leaves(name, facts, getattr(self, name))
-        )
-        return [leaf for leaf in every if leaf.free]
+        return [leaf for leaf in self.leaves if leaf.free]
 
     def with_free(self, numbers: Iterable[float]) -> Self:
         """Return the effect with other fitted numbers, in the order of `free_leaves`, limited by `limited`."""
-        left, changed = iter(numbers), {}
-        for name, facts in facts_of(type(self)).items():
-            value = getattr(self, name)
-            new = [next(left) if leaf.free else leaf.value for leaf in leaves(name, facts, value)]
-            changed[name] = with_leaves(value, iter(new))
+        left = iter(numbers)
+        every = iter([next(left) if leaf.free else leaf.value for leaf in self.leaves])
+        changed = {name: with_leaves(getattr(self, name), every) for name in facts_of(type(self))}
         return replace(self, **self.limited(changed))
 
     @classmethod

@@ -138,7 +138,9 @@ class Leaf(NamedTuple):
 
 def leaves(place: str, facts: Parameter, value: Any) -> Iterator[Leaf]:
     """Yield the numbers in a parameter."""
-    if is_dataclass(value):
+    if isinstance(value, float):  # first, as most are
+        yield Leaf(place, facts, value)
+    elif is_dataclass(value):
         for name, own in facts_of(type(value)).items():
             yield from leaves(f"{place}.{name}", own, getattr(value, name))
     elif isinstance(value, Mapping | tuple):
@@ -150,6 +152,8 @@ def leaves(place: str, facts: Parameter, value: Any) -> Iterator[Leaf]:
 
 def with_leaves(value: Any, numbers: Iterator[float]) -> Any:
     """Return a parameter with other numbers, in the order of `leaves`."""
+    if isinstance(value, float):
+        return next(numbers)
     if is_dataclass(value) and not isinstance(value, type):
         names = facts_of(type(value))
         return replace(value, **{name: with_leaves(getattr(value, name), numbers) for name in names})
@@ -165,9 +169,9 @@ def require_facts(effect: Any) -> None:
         value, (fewest, most) = getattr(effect, name), facts.count
         if isinstance(value, tuple | Mapping):
             require(effect, (name, fewest <= len(value) <= most, f"{fewest} to {most} of them"))
-        for leaf in leaves(name, facts, value):
-            if not leaf.facts.holds(leaf.value):
-                raise ModelError(f"effect '{effect.name}': {leaf.place} is {leaf.value}; it must be {leaf.facts.need}")
+    for leaf in effect.leaves:
+        if not leaf.facts.holds(leaf.value):
+            raise ModelError(f"effect '{effect.name}': {leaf.place} is {leaf.value}; it must be {leaf.facts.need}")
     for name, deviation in effect.uncertainty.items():
         if name.split(".")[0] not in known or not (isfinite(deviation) and deviation >= 0):
             raise ModelError(

@@ -14,6 +14,7 @@ from slpi_ros.workflows.records import (
     require_causes,
     require_for_model,
     shared_axes,
+    with_given_names,
 )
 
 
@@ -23,6 +24,7 @@ class DiagnoseRequest:
 
     source: Source
     model: StageModel
+    model_file: str | None = None  # the bags of the fit may be named by their place beside it
 
 
 @dataclass(frozen=True)
@@ -36,7 +38,8 @@ class DiagnoseOutcome:
 
 def diagnose(request: DiagnoseRequest) -> DiagnoseOutcome:
     """Find the causes of the errors of a model."""
-    source, model = request.source, request.model
+    source = request.source
+    model = with_given_names(request.model, source.bags, request.model_file)
     records = source.read(coupled=True, stage=model.hardware_id)
     with mismatch_in_data():
         source = replace(source, axes=shared_axes(records, model, source))

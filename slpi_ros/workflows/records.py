@@ -1,9 +1,11 @@
 """Reading of the records of a request, and the decision whether they can be used."""
 
+import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 from slpi_ros.diagnosis.prepare import no_cause, uncovered
@@ -14,6 +16,7 @@ from slpi_ros.io.bag_reader import read_bag, require_different, require_one_stag
 from slpi_ros.io.record import OUT_OF_ORDER, Course, Record, first_step_back
 from slpi_ros.io.stage_name import same_stage
 from slpi_ros.io.surroundings import clean, named_in
+from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.sensor import IDEAL, Sensor, corrected
 from slpi_ros.model.stage_model import StageModel
 
@@ -90,6 +93,22 @@ class Source:
     def for_model(self, model: StageModel) -> "Source":
         """Return the source with the quantities that a model follows, if any, unless others are named."""
         return self if self.surroundings is not None or model.quantities else replace(self, surroundings=())
+
+
+def with_given_names(model: StageModel, bags: Sequence[str], model_file: str | None) -> StageModel:
+    """Return a model with the names of its records as `bags` are given; those of the calibrator are beside its file."""
+    here = {os.path.realpath(bag): str(Path(bag)) for bag in bags}
+    places = ["", *([] if model_file is None else [os.path.dirname(model_file)])]
+
+    def named(source: str) -> str:
+        # A name out of a document need not be one of a file.
+        paths = [] if "\0" in source else [os.path.realpath(os.path.join(at, source)) for at in places]
+        return next((here[path] for path in paths if path in here), source)
+
+    def of(axis: AxisModel) -> AxisModel:
+        return replace(axis, quality=replace(axis.quality, source=", ".join(map(named, axis.quality.sources))))
+
+    return replace(model, axes={name: of(axis) for name, axis in model.axes.items()})
 
 
 def _with_chosen(record: Record, chosen: Sequence[str] | None) -> Record:

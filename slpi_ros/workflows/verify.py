@@ -2,7 +2,6 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 from slpi_ros.io.desired import desired_of
 from slpi_ros.io.record import Record
@@ -17,6 +16,7 @@ from slpi_ros.workflows.records import (
     require_followed,
     require_for_model,
     shared_axes,
+    with_given_names,
 )
 
 
@@ -56,6 +56,8 @@ def verify(request: VerifyRequest) -> VerifyOutcome:
     if not source.records:
         read = zip(source.bags, records, strict=True)
         desired = [desired_of(bag, record, request.desired_topic) for bag, record in read]
+    named = with_given_names(model, source.bags, request.model_file)
+    own = {name for axis in named.axes.values() for name in axis.quality.sources}
     with mismatch_in_data():
         source = replace(source, axes=shared_axes(records, model, source))
         found = require_for_model(records, model, source)
@@ -63,14 +65,6 @@ def verify(request: VerifyRequest) -> VerifyOutcome:
         told = verification.verify(
             records, model, request.tolerance, axes=source.axes, desired=desired, without_offset=request.without_offset,
             start=source.start, stop=source.stop, start_memory=request.start_memory,
-            own=[] if source.records else _of_the_fit(source.bags, model, request.model_file),
+            own=[] if source.records else [record.source for record in records if record.source in own],
         )  # fmt: skip
     return VerifyOutcome(told, records, found)
-
-
-def _of_the_fit(bags: Sequence[str], model: StageModel, model_file: str | None) -> list[str]:
-    """Return those of the bags that the model was identified from, by their paths."""
-    # Those of the calibrator are named by their place beside the model.
-    places = [Path(), *([] if model_file is None else [Path(model_file).parent])]
-    known = {(at / bag).resolve() for axis in model.axes.values() for bag in axis.quality.sources for at in places}
-    return [str(Path(bag)) for bag in bags if Path(bag).resolve() in known]

@@ -16,7 +16,7 @@ pytestmark = pytest.mark.slow
 SAMPLES = 12_000
 # Enough to see what is drawn.
 FEW = 3_000
-# All of them take minutes: `make bench-diagnosis`.
+# All of them take minutes: `make bench-confusion`.
 FAST = ["lag"]
 SLOW = [
     *("slew", "hum", "creep", "contact", "resonance", "cross_coupling", "sensor_periodic", "thermal_drift"),

@@ -3,9 +3,12 @@
 import numpy as np
 import pytest
 
+from slpi_ros.diagnosis.effect_parameters import EachRecord, free, moved, steps
 from slpi_ros.diagnosis.held_out import UNDETERMINED
-from slpi_ros.diagnosis.joint_fit import Equations, _thinned
+from slpi_ros.diagnosis.joint_fit import Equations, JointFit, _thinned
 from slpi_ros.diagnosis.prepare import Evidence, Part
+from slpi_ros.effects.gain_drift import GainDrift
+from slpi_ros.effects.lag import Lag
 from slpi_ros.identification.bases import SurfaceBasis
 from slpi_ros.identification.least_squares import FOLDS
 
@@ -74,6 +77,22 @@ def test_errors_of_blocks_left_out_are_those_of_fits_without_them():
     loss = losses(joint, y, columns)
     np.testing.assert_allclose(loss.errors, errors[judged], atol=1e-4 * loss.rms)
     assert np.count_nonzero(judged) > 0.8 * y.size and loss.records == pytest.approx([np.nanmean(errors**2)], rel=1e-4)
+
+
+def test_tangents_are_those_of_each_parameter_alone():
+    said, _ = evidence(3)
+    knots = ((7.0, 15.0), (5.0, 9.0, 15.0), (7.0, 15.0))
+    drift = EachRecord(tuple(GainDrift(times, (0.001, -0.002, 0.003)[: len(times)], 0.0) for times in knots))
+    fit = JointFit(said, [Lag(0.02), drift])
+    alone = []
+    for effect in fit.effects:
+        values = free(effect)
+        for k, step in enumerate(steps(effect, said.t, said.v)):
+            other = moved(effect, values + step * (np.arange(values.size) == k))
+            others = [other if one is effect else one for one in fit.effects]
+            alone.append((fit._whole(others) - fit.predicted) / step)
+    assert len(alone) == fit.tangents.shape[1] > 7
+    np.testing.assert_allclose(fit.tangents, np.column_stack(alone), rtol=0, atol=1e-15)
 
 
 @pytest.mark.parametrize("own", [False, True])

@@ -74,13 +74,16 @@ def test_loops_that_depend_on_bias_are_told_from_drift(measured_data):
     assert axis.after_rms < 0.3 * axis.before_rms
 
 
+SINES = "sine_1p02hz", "sine_0p49hz"
+
+
 @pytest.mark.long
-@pytest.mark.parametrize("given", [1, 2])
-def test_of_a_mirror_without_hysteresis_a_mode_is_named(measured_data, given):
-    """Whether the given model has fitted one of the two sines or both."""
-    sines = [import_table(measured_data / f"mirror_sine_{name}.csv") for name in ("1p02hz", "0p49hz")]
-    model = slpi_ros.identify(sines[:given])
-    diagnosis = slpi_ros.diagnose(sines, model)
+@pytest.mark.parametrize("names", [SINES, (*SINES, "square_250mv", "sawtooth_0p5hz")])
+def test_of_a_mirror_without_hysteresis_a_mode_is_named(measured_data, names):
+    """From two sines, and from two more records, of which a delay predicts the sawtooth better and all others worse."""
+    records = [import_table(measured_data / f"mirror_{name}.csv") for name in names]
+    model = slpi_ros.identify(records[:1])
+    diagnosis = slpi_ros.diagnose(records, model)
     (found,) = diagnosis.axes.values()
     assert [(one.name, one.alternatives) for one in found.effects] == [("resonance", ())]
     mode = max(found.effects[0].effect.modes, key=lambda one: one.gain)

@@ -71,6 +71,8 @@ def test_what_is_worse_on_one_record_does_not_beat_however_much_it_gains_on_othe
     with_it = loss(errors, 2)
     without = loss(np.concatenate([errors[:half] / factor, errors[half:] + 30.0 * NOISE]), 2)
     assert carries_over(with_it, without) is expected and beats(with_it, without, NOISE) is expected
+    # Of two different causes either may be the better one on some record.
+    assert beats(with_it, without, NOISE, contained=False) and not beats(without, with_it, NOISE, contained=False)
 
 
 def test_records_of_which_nothing_is_judged_decide_nothing():

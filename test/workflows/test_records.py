@@ -19,7 +19,7 @@ from slpi_ros.nodes.jobs import DiagnosisRequest, run_diagnosis
 from slpi_ros.workflows.diagnose import DiagnoseRequest, diagnose
 from slpi_ros.workflows.identify import IdentifyRequest
 from slpi_ros.workflows.identify import identify as identify_records
-from slpi_ros.workflows.records import Source, UnusableRecordError, assess_record
+from slpi_ros.workflows.records import Source, UnusableRecordError, assess_record, with_given_names
 from slpi_ros.workflows.refit import RefitRequest, refit
 from slpi_ros.workflows.verify import VerifyRequest, verify
 
@@ -154,3 +154,19 @@ def test_a_stage_that_is_accepted_is_taken_for_the_other_one(record, tmp_path, m
             other.read(stage=model)
     else:
         assert [each.hardware_id for each in other.read(stage=model)] == [first, second]
+
+
+def test_records_of_a_model_have_the_names_by_which_bags_are_given(model, tmp_path, monkeypatch):
+    axis = model.axes["x"]
+    sources = "02_calibration, gone, a\0b"
+    model = replace(model, axes={"x": replace(axis, quality=replace(axis.quality, source=sources))})
+    (tmp_path / "stage" / "02_calibration").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path)
+    for file, given, name in (
+        ("stage/model.json", "stage/02_calibration", "stage/02_calibration"),
+        (str(tmp_path / "stage" / "model.json"), "./stage/02_calibration/", "stage/02_calibration"),
+        ("model.json", "stage/02_calibration", "02_calibration"),
+        (None, "02_calibration", "02_calibration"),
+    ):
+        named = with_given_names(model, ["other", given], file)
+        assert named.axes["x"].quality.sources == [name, "gone", "a\0b"]

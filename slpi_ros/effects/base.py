@@ -311,6 +311,10 @@ class Effect(ABC):
         known = facts_of(type(self)).items()
         return tuple(leaf for name, facts in known for leaf in leaves(name, facts, getattr(self, name)))
 
+    def __getstate__(self) -> dict[str, Any]:
+        # To other processes go the parameters alone: their facts hold functions.
+        return {name: value for name, value in vars(self).items() if name != "leaves"}
+
     def free_leaves(self) -> list[Leaf]:
         """Return the fitted numbers."""
         return [leaf for leaf in self.leaves if leaf.free]

@@ -1,6 +1,7 @@
 """The free parameters of every effect as one vector."""
 
 from dataclasses import fields
+from multiprocessing.reduction import ForkingPickler
 
 import numpy as np
 import pytest
@@ -25,6 +26,13 @@ def test_each_free_parameter_has_a_name_and_a_step_that_changes_it(effect):
     assert len(names(effect)) == values.size == own.size
     for k in range(own.size):
         assert moved(effect, values + own * (np.arange(own.size) == k)) != effect
+
+
+@given(EVERY)
+def test_an_effect_goes_to_another_process_with_its_parameters_alone(effect):
+    assert free(effect).size == len(effect.free_leaves())
+    other = ForkingPickler.loads(ForkingPickler.dumps(effect))
+    assert other == effect and "leaves" not in vars(other) and other.leaves == effect.leaves
 
 
 @given(EVERY)

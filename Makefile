@@ -109,7 +109,7 @@ $(BUILD_STAMP): $(VENV_STAMP) $(INSTALLED)
 	@$(COLCON) --log-base log$(SUFFIX) build --build-base build$(SUFFIX) --install-base $(INSTALL) --symlink-install \
 		--event-handlers console_start_end- summary-
 	@touch $@
-	@echo 'slpi_ros: built; each terminal needs: source $(INSTALL)/setup.bash'
+	@echo 'slpi_ros: built; each terminal needs: source $(INSTALL)/setup.bash; export PATH="$$PWD/.venv$(SUFFIX)/bin:$$PATH"'
 
 # The types are checked beside the tests, of which those with nodes wait most of their time.
 test: build

@@ -1,8 +1,7 @@
 """The error that the calibrator promises, beside that of scans five minutes later: after a reset, and after a restart.
 
 The decisions and the physics are those of the node and of the simulated stage, in stage time, without ROS between
-them. All errors are measured - desired, with
-the constant offset, after ~/set_zero. Run it with ``make bench-promise``.
+them. All errors are measured - desired, with the constant offset, after ~/set_zero. Run it with ``make bench-promise``.
 """
 
 # To be set before NumPy is imported: the processes share the cores.
@@ -49,7 +48,7 @@ FACTOR = 1.5
 
 
 class Bench:
-    """A simulated stage in stage time, and the voltages that it was given."""
+    """A simulated stage in stage time."""
 
     def __init__(self, stage: Stage) -> None:
         self.stage, self.now = stage, 1000.0

@@ -90,7 +90,7 @@ def run(options: Namespace) -> Result:
     elif found.verdict == UNPROVED and not any(done.independent):
         next_command = f"slpi verify OTHER_BAG --model {shlex.quote(options.model)}"
     elif any(record.foreign for axis in found.axes.values() for record in axis.records):
-        # A cause that a model lacks never halves or doubles its loops.
+        # Another stage or other units, as is said: nothing that a diagnosis looks for.
         next_command = command_line("slpi", "doctor", *options.bags, "--model", options.model)
     else:
         next_command = common.diagnosis_of(options, options.model)

@@ -33,8 +33,9 @@ def beats(one: Loss, other: Loss, noise: float, trials: float = 1.0, *, containe
     """
     own, its = one.beside(other)
     fall = float(np.mean(its**2) - np.mean(own**2))
-    better = fall > (LEAST * noise) ** 2 and chance(one, other, trials) <= CHANCE
-    return better and (not contained or carries_over(one, other))
+    if not fall > (LEAST * noise) ** 2 or (contained and not carries_over(one, other)):
+        return False
+    return chance(one, other, trials) <= CHANCE
 
 
 def carries_over(one: Loss, other: Loss) -> bool:

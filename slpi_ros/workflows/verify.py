@@ -57,7 +57,7 @@ def verify(request: VerifyRequest) -> VerifyOutcome:
         read = zip(source.bags, records, strict=True)
         desired = [desired_of(bag, record, request.desired_topic) for bag, record in read]
     named = with_given_names(model, source.bags, request.model_file)
-    own = {name for axis in named.axes.values() for name in axis.quality.sources}
+    own = [] if source.records else [name for axis in named.axes.values() for name in axis.quality.sources]
     with mismatch_in_data():
         source = replace(source, axes=shared_axes(records, model, source))
         found = require_for_model(records, model, source)
@@ -65,6 +65,6 @@ def verify(request: VerifyRequest) -> VerifyOutcome:
         told = verification.verify(
             records, model, request.tolerance, axes=source.axes, desired=desired, without_offset=request.without_offset,
             start=source.start, stop=source.stop, start_memory=request.start_memory,
-            own=[] if source.records else [record.source for record in records if record.source in own],
+            own=own,
         )  # fmt: skip
     return VerifyOutcome(told, records, found)

@@ -1,27 +1,22 @@
 """Further records of a hidden stage, and the drive that a diagnosis advises."""
 
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
+from scripts import importable
 
-BENCHMARKS = str(Path(__file__).resolve().parents[2] / "benchmarks")
 RATE, SECONDS = 200.0, 8.0
 
 
 @pytest.fixture(scope="module")
 def benchmarks():
     """Return the modules under test, imported as scripts import them."""
-    sys.path.append(BENCHMARKS)
-    try:
+    with importable("benchmarks"):
         import confusion
         import hidden
 
         yield {"hidden": hidden, "confusion": confusion}
-    finally:
-        sys.path.remove(BENCHMARKS)
 
 
 @pytest.fixture(scope="module")

@@ -1,13 +1,11 @@
 """The promise of the calibrator in the demo: the best row, and a reason where promise and run differ."""
 
 import re
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
+from scripts import importable
 
-DEMO = str(Path(__file__).resolve().parents[2] / "demo")
 RATE = 100.0
 T = np.arange(1000) / RATE
 Y = 5e-6 + 3e-6 * np.sin(2.0 * np.pi * T / 3.0)
@@ -16,14 +14,11 @@ Y = 5e-6 + 3e-6 * np.sin(2.0 * np.pi * T / 3.0)
 @pytest.fixture(scope="module")
 def demo():
     """Return the modules under test, imported as scripts import them."""
-    sys.path.append(DEMO)
-    try:
+    with importable("demo"):
         import plots
         import promise
 
         yield {"plots": plots, "promise": promise}
-    finally:
-        sys.path.remove(DEMO)
 
 
 @pytest.fixture

@@ -1,24 +1,18 @@
 """Spoiled records lead to nearly the same model: a small part of ``benchmarks/robustness.py``."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
+from scripts import importable
 
-BENCHMARKS = str(Path(__file__).resolve().parents[2] / "benchmarks")
 SEED, SECONDS, RATE = 1, 30.0, 200.0
 
 
 @pytest.fixture(scope="module")
 def robustness():
-    sys.path.append(BENCHMARKS)
-    try:
+    with importable("benchmarks"):
         import robustness
 
         yield robustness
-    finally:
-        sys.path.remove(BENCHMARKS)
 
 
 @pytest.fixture(scope="module")

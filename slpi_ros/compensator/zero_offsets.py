@@ -1,14 +1,17 @@
 """Measured - model displacement of one axis, of the present and of the last reset, from which its zero is set."""
 
 from collections import deque
-from statistics import fmean, median
+from statistics import median
+
+import numpy as np
 
 from slpi_ros.io.messages import SECOND_NS
 
 # Most measurements for the offset of an axis, and how old they may be.
 OFFSETS, OFFSET_AGE_NS = 50, SECOND_NS // 5
-# How long after a reset the zero is that of its sweep, if nothing has moved: time to call for it by hand.
-SWEEP_AGE_NS = 60 * SECOND_NS
+# Most measurements of a reset, the latest, and how long after it the zero is that of the reset, if nothing has moved:
+# time to call for it by hand.
+OF_RESET, RESET_AGE_NS = 100_000, 60 * SECOND_NS
 
 
 class ZeroOffsets:
@@ -16,23 +19,23 @@ class ZeroOffsets:
 
     def __init__(self) -> None:
         self._recent: deque[tuple[int, float]] = deque(maxlen=OFFSETS)
-        # With the number of the swing before them, until the axis moves otherwise.
-        self._sweep: list[tuple[int, int, float]] = []
+        # With the displacement of the model (m), until the axis moves otherwise.
+        self._reset: deque[tuple[int, float, float]] = deque(maxlen=OF_RESET)
 
-    def take(self, offset: float, swing: int, now_ns: int) -> None:
-        """Take an offset (m); `swing`: of a reset, with a known memory; 0: none."""
-        self._recent.append((now_ns, offset))
-        if swing:
-            self._sweep.append((now_ns, swing, offset))
+    def take(self, reading: float, expected: float, resetting: bool, now_ns: int) -> None:
+        """Take a reading and the displacement of the model (m); `resetting`: in a reset, with a known memory."""
+        self._recent.append((now_ns, reading - expected))
+        if resetting:
+            self._reset.append((now_ns, reading - expected, expected))
 
     def leave_reset(self) -> None:
         """Forget the reset: the axis moves otherwise."""
-        self._sweep.clear()
+        self._reset.clear()
 
     def forget(self) -> None:
         """Forget all: the zero has moved."""
         self._recent.clear()
-        self._sweep.clear()
+        self._reset.clear()
 
     def latest(self, now_ns: int) -> float | None:
         """Return the offset (m) of the last 0.2 s; None without a measurement."""
@@ -42,12 +45,26 @@ class ZeroOffsets:
     def present(self, now_ns: int) -> float | None:
         """Return the present offset (m); None without a measurement in the last 0.2 s.
 
-        Right after a reset it is that of its first swings down and up over the range, as the calibrator takes it from a
-        sweep: what relaxes afterwards is not in it, and what differs between falling and rising voltages cancels.
+        Right after a reset it is that of the reset: what relaxes afterwards is not in it.
         """
         recent = self.latest(now_ns)
-        if recent is not None and self._sweep and now_ns - self._sweep[-1][0] <= SWEEP_AGE_NS:
-            swings = [[offset for _, swing, offset in self._sweep if swing == each] for each in (1, 2)]
-            if all(swings):
-                return fmean(map(median, swings))
+        if recent is not None and self._reset and now_ns - self._reset[-1][0] <= RESET_AGE_NS:
+            of_reset = self._of_reset()
+            return recent if of_reset is None else of_reset
         return recent
+
+    def _of_reset(self) -> float | None:
+        """Return the offset (m) of the reset; None if the model has not moved both ways."""
+        t, offset, expected = np.array(self._reset).T
+        t, first = np.unique(t, return_index=True)
+        if t.size < 2:
+            return None
+        velocity = np.gradient(expected[first], t)
+        # A reading that comes late by `T` is off by `-T` times the velocity, in the median of rising displacements and
+        # in that of falling ones: both agree on the zero.
+        up, down = velocity > 0.0, velocity < 0.0
+        if not (up.any() and down.any()):
+            return None
+        rising, falling = float(np.median(velocity[up])), float(np.median(velocity[down]))
+        above, below = float(np.median(offset[first][up])), float(np.median(offset[first][down]))
+        return (below * rising - above * falling) / (rising - falling)

@@ -207,7 +207,7 @@ def _refitted(model: AxisModel, record: Record) -> AxisModel:
 
     def fitted(one: AxisModel) -> AxisModel:
         around = EffectContext(t)
-        u, _ = Chain.of(one.effects).reaching(v, around)
+        _, u, _ = Chain.of(one.effects).reaching(v, around)
         h = y - (one.simulate(t, v, of_record=True) - one.hysteresis_only.simulate(t, u))
         felt = Record(record.time_ns, {axis: u}, {axis: h}, source=record.source)
         return replace(slpi_ros.identify(felt).axes[axis], effects=one.effects)

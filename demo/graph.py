@@ -64,7 +64,7 @@ class Operator(Node):
         self.voltage = self.create_publisher(Float64MultiArray, "voltage_command", QOS)
         self.desired = self.create_publisher(JointState, "desired_displacement", QOS)
         self._answers: list[tuple[float, float]] = []
-        self.late = 0  # messages of the last path
+        self.late: list[int] = []  # messages of the last path
         self.state = JointState()
         self.create_subscription(JointState, "stage_state", self._keep, QOS)
         self._reports: list[dict[str, str]] = []
@@ -123,7 +123,7 @@ class Operator(Node):
 
     def _send(self, messages: Sequence[Any], publish: Callable[[Any], None], rate: float) -> FloatArray:
         """Return the last answer to each message: while the compensator holds or slews there are several."""
-        kept, self.late = [], 0
+        kept, self.late = [], []
         due, begin = time.monotonic(), self.get_clock().now() - Duration(seconds=time.monotonic())
         for k, message in enumerate(messages):
             time.sleep(max(0.0, due - time.monotonic()))
@@ -133,7 +133,8 @@ class Operator(Node):
             # On a busy machine the path is followed more slowly, and its stamps say so.
             now = time.monotonic()
             if now > due + 1.0 / rate:
-                due, self.late = now, self.late + 1
+                due = now
+                self.late.append(k)
             if isinstance(message, JointState):
                 # The time at which it is meant: those at which messages are sent are less even.
                 message.header.stamp = (begin + Duration(seconds=due)).to_msg()

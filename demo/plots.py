@@ -30,8 +30,8 @@ class Run:
         Desired and measured displacement.
     held : float
         Share of the samples that were out of reach and held at a voltage limit; default 0.
-    late : float
-        Share of the samples that were sent later than at the next one's time; default 0.
+    late : tuple of float, seconds
+        Times of the samples that were sent later than at the next one's time; default none.
     """
 
     name: str
@@ -39,7 +39,7 @@ class Run:
     desired: FloatArray
     displacement: FloatArray
     held: float = 0.0
-    late: float = 0.0
+    late: tuple[float, ...] = ()
 
     @property
     def error(self) -> FloatArray:

@@ -106,7 +106,8 @@ def follow_compensated(stage: Operator, name: str, model: Path, t: FloatArray, y
         path = np.concatenate([approach, y])
         asked = slpi_ros.load_model(model).axes["x"].in_advance(np.arange(path.size) / RATE, path)
         measured = stage.follow(asked.tolist(), RATE)[-y.size :, 1]
-        return plots.Run(name, t, y, measured, stage.held_at_limit() / y.size, stage.late / asked.size)
+        late = tuple(float(t[max(k - approach.size, 0)]) for k in stage.late)
+        return plots.Run(name, t, y, measured, stage.held_at_limit() / y.size, late)
 
 
 def compared(seed: int, models: Mapping[str, Path], duration: float, warm_up: float) -> list[plots.Run]:

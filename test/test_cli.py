@@ -245,6 +245,15 @@ def test_a_thousandth_of_the_unit_is_told_before_anything_else(folder, tmp_path)
     assert "check the unit" in slpi("doctor", tmp_path / "nm", *model, "--no-ros").stdout.splitlines()[-1]
 
 
+@pytest.mark.parametrize("column", [1, 2])
+def test_an_import_tells_of_a_column_that_stays_constant(tmp_path, column):
+    rows = np.column_stack([np.arange(50) / 50, np.linspace(0, 100, 50), np.linspace(0, 10, 50)])
+    rows[:, column] = 5.0
+    np.savetxt(tmp_path / "d.csv", rows, delimiter=",", header="time_s,x_V,x_um", comments="")
+    done = slpi("import", tmp_path / "d.csv", "-o", tmp_path / "b")
+    assert done.returncode == 0 and ("voltage", "displacement")[column - 1] in done.stderr and "5" in done.stderr
+
+
 def test_a_table_is_named_once_in_a_message(folder, tmp_path):
     path = another_axis(folder, tmp_path)[0][2]
     for command, suffix in (("compensate", "m"), ("simulate", "V")):

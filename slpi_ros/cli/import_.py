@@ -70,6 +70,8 @@ def add_options(command: ArgumentParser) -> None:
 
 def run(options: Namespace) -> Result:
     """Run the command."""
+    import numpy as np
+
     from slpi_ros.compensator.plausible import implausible
     from slpi_ros.io.bag_writer import write_bag
     from slpi_ros.io.columns import ColumnOptions
@@ -81,6 +83,11 @@ def run(options: Namespace) -> Result:
     table = import_with_summary(options.table, columns)
     record = replace(table.record, hardware_id=options.hardware_id)
     for axis, y in record.displacement.items():
+        for what, values, unit in (("voltage", record.voltage[axis], "V"), ("displacement", y, "m")):
+            known = values[np.isfinite(values)]
+            if known.size and known.min() == known.max():
+                told = f"the {what} stays at {known[0]:.6g} {unit}: nothing can be identified from it"
+                options.remarks.append(f"axis '{axis}': {told}; check the columns")
         if wrong := implausible(record.voltage[axis], y):
             wrong += ", which no piezo stage has; check the columns and their units"
             options.remarks.append(f"axis '{axis}': {wrong}")

@@ -16,10 +16,13 @@ from slpi_ros.io.alignment import between
 from slpi_ros.io.array_files import HDF5, TDMS, ZIP, load_arrays
 from slpi_ros.io.atomic_file import all_or_nothing
 from slpi_ros.io.columns import (
+    DISPLACEMENT,
     TIME,
+    VOLTAGE,
     Column,
     ColumnChoice,
     ColumnOptions,
+    ColumnQuantity,
     choose_columns,
     is_line,
     joined,
@@ -228,12 +231,15 @@ def read_table_with(
     path: str | os.PathLike[str], suffix: str, beside: Sequence[str]
 ) -> tuple[FloatArray, dict[str, FloatArray], dict[str, FloatArray]]:
     """Read times (s), finite values (V or m) by axis, and quantities by name, (N,) each, from a table of a command."""
-    # The columns are ``time_s``, ``<axis>_<suffix>``, "V" or "m", and of `beside` those that are there, in any order;
-    # others are ignored. A quantity is held where its cells are empty.
+    # The columns are ``time_s``, ``<axis>_<suffix>``, "V" or "m", else in another unit of the same quantity, as in
+    # x_um, and of `beside` those that are there, in any order; others are ignored. A quantity is held where its cells
+    # are empty.
     table = load_table(Path(path))
     ending = _ending(suffix)
     own = [name for name in table.columns if name not in beside]
-    columns = {n.removesuffix(ending): n for n in own if n.endswith(ending) and n != ending}
+    columns, scale = {n.removesuffix(ending): n for n in own if n.endswith(ending) and n != ending}, 1.0
+    if not columns:
+        columns, scale = _in_another_unit(own, VOLTAGE if suffix == VOLTAGE.default else DISPLACEMENT)
     if not columns:
         raise RecordError(
             f"{path}: no column <axis>{ending}; there is {table.listing()}; write such names above the columns, or "
@@ -254,8 +260,17 @@ def read_table_with(
             "no finite number (an empty cell counts as nan); write one into every cell",
         )
     _require_order(values[time], time, table)
-    by_axis = {axis: values[column] for axis, column in columns.items()}
+    by_axis = {axis: scale * values[column] for axis, column in columns.items()}
     return values[time], by_axis, {name: values[name] for name in also}
+
+
+def _in_another_unit(names: Sequence[str], quantity: ColumnQuantity) -> tuple[dict[str, str], float]:
+    """Return the columns ``<axis>_<unit>`` of the first unit of which there are any, by axis, and its SI value."""
+    for unit, scale in quantity.units.items():
+        parts = {name: name.rpartition("_") for name in names}
+        if found := {axis: name for name, (axis, _, end) in parts.items() if axis and quantity.unit(end) == unit}:
+            return found, scale
+    return {}, 1.0
 
 
 def _held(values: FloatArray) -> FloatArray:

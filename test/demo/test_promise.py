@@ -44,5 +44,13 @@ def test_a_reason_is_told_only_where_promise_and_run_differ(demo, run):
         found = re.search(r"it is the (\w+)(.*):", kept(8e-9, [other, run("causes", error)]))
         sizes = [float(each) for each in re.findall(r"[\d.-]+", found[2])]
         assert found[1] == cause and size in [pytest.approx(each, rel=0.1) for each in sizes]
+    # What none of them explains is said, and a computer that was too busy from some time on.
+    bump = np.where((T > 6.0) & (T < 7.0), 250e-9, 0.0)
+    assert "None of" in kept(8e-9, [other, run("causes", bump)])
+    busy = demo["plots"].Run("causes", T, Y, run("causes", bump).displacement, late=(6.0, 6.1))
+    assert re.search(
+        r"it is the busy computer.* 2 setpoints .*6\.0 s.*: without it ([\d.]+)", kept(8e-9, [other, busy])
+    )
+    assert "it is" not in kept(80e-9, [other, run("causes", 0.0)]).split("here it is")[1]
     # The model with causes is as promised, but another one is better.
     assert "with SLPI" in kept(8e-9, [other, run("SLPI", -0.2e-9), run("SLPI with causes", 1e-9)])

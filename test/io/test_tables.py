@@ -294,6 +294,21 @@ def test_table_round_trip_is_exact(tmp_path, rows, suffix):
     assert os.listdir(tmp_path) == ["table.csv"]
 
 
+def test_other_units_count_where_none_is_in_si(table):
+    rows = ("0,1,2", "1,3,4")
+    for header, suffix, scale in (("x_um,y_um", "m", 1e-6), ("x_nm,y_nm", "m", 1e-9), ("x_mV,y_mV", "V", 1e-3)):
+        _, columns = read_table(table(f"time_s,{header}", *rows), suffix)
+        assert {axis: values.tolist() for axis, values in columns.items()} == {
+            "x": [1 * scale, 3 * scale],
+            "y": [2 * scale, 4 * scale],
+        }
+    _, columns = read_table(table("time_s,x_um,x_m", *rows), "m")
+    assert columns["x"].tolist() == [2, 4]
+    for header in ("time_s,um,x_V", "time_s,_um,x_V", "time_s,x_kg,x_V"):
+        with pytest.raises(RecordError, match="_m"):
+            read_table(table(header, *rows), "m")
+
+
 def test_only_the_wanted_columns_count(table):
     path = table("note,x_m,time_s,y_V,x_V", "a,,0,1,2", "b,,0,3,4", "c,nan,0.5,5,6")
     t, columns = read_table(path, "V")

@@ -30,6 +30,7 @@ from promise import best_of, kept  # noqa: E402
 
 import slpi_ros  # noqa: E402
 from benchmarks.paths import scan_path  # noqa: E402
+from slpi_ros.calibration.settings import VERIFICATION  # noqa: E402
 from slpi_ros.reports.page import Page, png  # noqa: E402
 from slpi_ros.reports.text import describe_model  # noqa: E402
 from slpi_ros.simulation.stage import Stage  # noqa: E402
@@ -183,7 +184,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("demo_output"), help="folder for the pages")
     parser.add_argument("--seed", type=int, help="which stage; default: a random one")
-    parser.add_argument("--path", type=float, default=10.0, help="seconds of path to follow")
+    parser.add_argument("--path", type=float, default=VERIFICATION, help="seconds of path; default: as the calibrator")
     options = parser.parse_args()
     require_nobody_else()
     began = time.monotonic()

@@ -31,8 +31,8 @@ SWEEP_SECONDS, RETURN_SECONDS, REST_SECONDS = 4.0, 1.0, 0.2
 PATIENCE, CLOSE = 1.0, 1e-6
 # A drive that is too short for its slew limit is made longer by this factor, at most this many times.
 LONGER, LENGTHENINGS = 1.4, 8
-# Time to compute between two records, for each of them: the stage rests; longest pause that is simulated; seconds.
-COMPUTING, LONGEST_PAUSE = 4.0, 300.0
+# Longest pause between two records that is simulated, seconds.
+LONGEST_PAUSE = 300.0
 # Start of the stamps for the compensator: not 0, which means none, nanoseconds.
 FIRST_STAMP = SECOND_NS
 
@@ -89,12 +89,13 @@ def compensated(
     model: StageModel,
     seed: int,
     before: Sequence[Record] = (),
+    pause: float = 0.0,
     *,
     in_advance: bool = True,
 ) -> tuple[Drive, dict[str, FloatArray]]:
     """Return a drive along a random path through the compensator, after a sweep that makes the memory known.
 
-    With `in_advance` a delay is undone, as on a trajectory.
+    It begins `pause` (s) after the records `before`. With `in_advance` a delay is undone, as on a trajectory.
     """
     # Also the desired displacement (m) of each axis, shape (N,): NaN in the sweep before and the return after the path.
     sweep = exciting(settings, SWEEP, _sweep_seconds(settings), settings.axes, seed)
@@ -108,7 +109,7 @@ def compensated(
             t, voltage = driven_so_far(before)
             for v, passed in zip(voltage[axis.name].tolist(), np.diff(t, prepend=t[0]).tolist(), strict=True):
                 axis.stream.drive(v, passed)
-            axis.stream.wait(COMPUTING * len(before))
+            axis.stream.wait(pause)
     for row in swept.tolist():
         for axis, v in zip(controller.axes, row, strict=True):
             axis.stream.drive(v, dt)
@@ -141,12 +142,19 @@ def compensated(
     return drive, {axis: np.pad(y, (0, drive.t.size - y.size), constant_values=np.nan) for axis, y in wanted.items()}
 
 
-def driven_so_far(records: Sequence[Record]) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Return times (s) and voltages (V) of successive records; a long pause between them is shortened."""
+def driven_so_far(
+    records: Sequence[Record], last_pause: float | None = None
+) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Return times (s) and voltages (V) of successive records; a long pause between them is shortened.
+
+    `last_pause`: that before the last record, s; default: by the stamps.
+    """
     known = [np.all([np.isfinite(v) for v in record.voltage.values()], axis=0) for record in records]
     time_ns = np.concatenate([record.time_ns[own] for record, own in zip(records, known, strict=True)])
-    t = np.cumsum(np.minimum(np.diff(time_ns, prepend=time_ns[0]) * 1e-9, LONGEST_PAUSE))
-    return t, {
+    steps = np.minimum(np.diff(time_ns, prepend=time_ns[0]) * 1e-9, LONGEST_PAUSE)
+    if last_pause is not None:
+        steps[-np.count_nonzero(known[-1])] = last_pause
+    return np.cumsum(steps), {
         axis: np.concatenate([record.voltage[axis][own] for record, own in zip(records, known, strict=True)])
         for axis in records[0].voltage
     }

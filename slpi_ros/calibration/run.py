@@ -10,7 +10,14 @@ import numpy as np
 from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.calibration.choice import next_drive
 from slpi_ros.calibration.closed_loop import RASTER, AxisLoop, LoopResult, loops_of, moving, showing, too_slow
-from slpi_ros.calibration.drives import SWEEP_SECONDS, checking, compensated, driven_so_far, exciting
+from slpi_ros.calibration.drives import (
+    LONGEST_PAUSE,
+    SWEEP_SECONDS,
+    checking,
+    compensated,
+    driven_so_far,
+    exciting,
+)
 from slpi_ros.calibration.kept import FOLLOWS, naming, require_kept
 from slpi_ros.calibration.settings import CALIBRATION, CalibrationSettings
 from slpi_ros.compensator.loop_design import design
@@ -154,17 +161,31 @@ Recorder = Callable[[Request], Recording]
 
 
 def calibrate(
-    settings: CalibrationSettings, record: Recorder, report: Callable[[Progress], None] = lambda progress: None
+    settings: CalibrationSettings,
+    record: Recorder,
+    report: Callable[[Progress], None] = lambda progress: None,
+    clock: Callable[[], float] = time.monotonic,
 ) -> Outcome:
-    """Calibrate a stage by itself; SlpiError if it does not follow the voltages, or the records allow no model."""
+    """Calibrate a stage by itself; SlpiError if it does not follow the voltages, or the records allow no model.
+
+    `clock`: the time of the stage, s, from any begin.
+    """
     # `record` drives the stage and returns what it did; an exception ends the calibration. Given the same records it
     # takes the same decisions, so a calibration that was interrupted goes on where its records end.
-    return _Calibration(settings, record, report).run()
+    return _Calibration(settings, record, report, clock).run()
 
 
 class _Calibration:
-    def __init__(self, settings: CalibrationSettings, record: Recorder, report: Callable[[Progress], None]) -> None:
-        self._settings, self._record, self._report = settings, record, report
+    def __init__(
+        self,
+        settings: CalibrationSettings,
+        record: Recorder,
+        report: Callable[[Progress], None],
+        clock: Callable[[], float],
+    ) -> None:
+        self._settings, self._record, self._report, self._clock = settings, record, report, clock
+        # When the last record has ended, and the time that it took beside its drive, seconds.
+        self._ended, self._beside = clock(), 0.0
         self._steps: list[Step] = []
         self._records: list[Record] = []
         # Record of the check.
@@ -226,6 +247,11 @@ class _Calibration:
         """Sum of the durations of all drives so far, seconds."""
         return sum(step.seconds for step in self._steps)
 
+    @property
+    def _pause(self) -> float:
+        """Time (s) from the end of the last record to the next drive, as far as is known before it."""
+        return min(self._clock() - self._ended + self._beside, LONGEST_PAUSE)
+
     def _begin(self, doing: str, missing: tuple[Finding, ...] = ()) -> None:
         errors = self._verified[-1][1] if self._verified else {}
         worst = max((error.mean for error in errors.values()), default=None)
@@ -252,7 +278,10 @@ class _Calibration:
     ) -> Recording:
         name = f"{len(self._steps) + 1:02d}_{kind}"
         self._begin(f"recording {name}")
+        asked = self._clock()
         recording = self._record(Request(name, drive, desired, loops or {}))
+        self._ended = self._clock()
+        self._beside = max(self._ended - asked - float(drive.t[-1]), 0.0)
         if recording.kept:
             fitted = kind not in (CHECK_DRIVE, SWEEP, LOOP_DRIVE)
             require_kept(recording.record, drive, self._settings, self._first, fitted=fitted)
@@ -330,12 +359,16 @@ class _Calibration:
 
     def _verify(self, model: StageModel) -> dict[str, TrackingError]:
         model = with_present_zero(model, self._records)
-        drive, desired = compensated(self._settings, model, len(self._steps), self._records)
+        pause = self._pause
+        drive, desired = compensated(self._settings, model, len(self._steps), self._records, pause)
         recording = self._recorded(VERIFICATION_DRIVE, drive, desired)
-        # What the zero has done between two records is no error of the model, and after a reset ~/set_zero removes it.
-        moved = moved_zeros(model, [*self._records, before_path(recording)])
+        # What the zero has done between two records is no error of the model, and after a reset ~/set_zero removes it,
+        # together with the creep of a pause that is not as the path assumes.
+        driven = [*self._records, before_path(recording)]
+        moved = moved_zeros(model, driven)
+        removed = moved if recording.kept else moved_zeros(model, driven, pause)
         errors = {
-            axis: tracking_error(recording, axis, model, self._settings.goal(self._repeatability[axis]), moved[axis])
+            axis: tracking_error(recording, axis, model, self._settings.goal(self._repeatability[axis]), removed[axis])
             for axis in self._settings.axes
         }
         finding = "; ".join(
@@ -366,7 +399,7 @@ class _Calibration:
         if shown:
             model = with_present_zero(model, self._records)
             path = replace(settings, path=showing(settings, model))
-            drive, desired = compensated(path, model, len(self._steps), self._records, in_advance=False)
+            drive, desired = compensated(path, model, len(self._steps), self._records, self._pause, in_advance=False)
             recording = self._recorded(LOOP_DRIVE, drive, desired, loops_of(found, model))
             for name, one in shown.items():
                 error = tracking_error(recording, name, model, settings.goal(self._repeatability[name]))
@@ -423,10 +456,13 @@ def before_path(recording: Recording) -> Record:
     return recording.record.part(slice(0, int(np.argmax(along))))
 
 
-def moved_zeros(model: StageModel, records: Sequence[Record]) -> dict[str, float]:
-    """Return by how much (m) the zero of each axis differs from the model in the last of the records."""
+def moved_zeros(model: StageModel, records: Sequence[Record], last_pause: float | None = None) -> dict[str, float]:
+    """Return by how much (m) the zero of each axis differs from the model in the last of the records.
+
+    `last_pause` as in `driven_so_far`.
+    """
     # The median over rising and falling voltages: lag, rate and width of the loops cancel.
-    t, voltage = driven_so_far(records)
+    t, voltage = driven_so_far(records, last_pause)
     seen = model.simulate(t, voltage)
     last = records[-1]
     known = np.all([np.isfinite(v) for v in last.voltage.values()], axis=0)

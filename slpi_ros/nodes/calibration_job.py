@@ -3,6 +3,7 @@
 import multiprocessing
 import os
 import threading
+import time
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from multiprocessing.connection import Connection, wait
@@ -58,10 +59,13 @@ class CalibrationJob(WorkerProcess[CalibrationRequest, Progress | Wanted | Calib
         what = "calibrator: the computation"
         super().__init__(run_calibration, (settings, output), CalibrationOutcome, what, talks=True)
 
-    def recorded(self, off: str) -> None:
-        """Tell the worker that its drive is recorded, and why feedback was switched off; `outcome` tells of its end."""
+    def recorded(self, off: str, clock: float) -> None:
+        """Tell the worker that its drive is recorded, why feedback was switched off, and the time of the stage (s).
+
+        `outcome` tells of its end.
+        """
         with suppress(BrokenPipeError, ConnectionResetError):
-            self.connection.send(off)
+            self.connection.send((off, clock))
 
 
 def run_calibration(request: CalibrationRequest, node: Connection) -> CalibrationOutcome:
@@ -72,6 +76,7 @@ def run_calibration(request: CalibrationRequest, node: Connection) -> Calibratio
 
     threading.Thread(target=_end_with_parent, daemon=True).start()
     settings, output = request
+    clock = _StageClock()
 
     def record(wanted: Request) -> Recording:
         kept = (output / wanted.name).exists()
@@ -79,15 +84,38 @@ def run_calibration(request: CalibrationRequest, node: Connection) -> Calibratio
             columns = np.column_stack([*wanted.drive.voltage.values(), *wanted.desired.values()])
             voltage, desired = np.split(columns, [len(wanted.drive.voltage)], axis=1)
             node.send(Wanted(wanted.name, wanted.drive.t, voltage, desired, tuple(wanted.loops.values())))
-        off = "" if kept else node.recv()
+        off = ""
+        if not kept:
+            off, now = node.recv()
+            clock.set(now)
         return replace(recording_of(output, wanted), kept=kept, off=off)
 
     try:
-        outcome = calibrate(settings, record, node.send)
+        outcome = calibrate(settings, record, node.send, clock)
         write_files(output, outcome)
     except SlpiError as error:
         return CalibrationOutcome(error=str(error), exit_code=error.exit_code)
     return CalibrationOutcome(format_model(outcome.model), outcome.met, outcome.why)
+
+
+class _StageClock:
+    """Time of the stage (s), which may be simulated: as fast as between the last two times that it was set."""
+
+    def __init__(self) -> None:
+        self._set: tuple[float, float] | None = None  # time of the stage, and steady clock of this process, s
+        self._speed = 1.0
+
+    def set(self, now: float) -> None:
+        """Set it to `now` (s)."""
+        steady = time.monotonic()
+        if self._set and steady > self._set[1]:
+            self._speed = max(now - self._set[0], 0.0) / (steady - self._set[1])
+        self._set = now, steady
+
+    def __call__(self) -> float:
+        """Return the time (s)."""
+        at, steady = self._set or (0.0, 0.0)
+        return at + self._speed * (time.monotonic() - steady)
 
 
 def stage_of_kept(output: Path) -> str:

@@ -306,7 +306,7 @@ class Calibrator(Node):
         self._guard.end()
         job.close(interrupted=self._failure is not None)
         if self._failure is None and self._worker is not None:
-            self._worker.recorded(job.loop.off if job.loop else "")
+            self._worker.recorded(job.loop.off if job.loop else "", self._drive_clock.now().nanoseconds * 1e-9)
 
     # What is watched
 

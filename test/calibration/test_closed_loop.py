@@ -86,7 +86,7 @@ def test_a_loop_that_is_computed_too_seldom_shows_nothing_of_its_gains():
 @pytest.mark.long
 def test_a_calibration_with_tuning_shows_its_loop_on_the_stage(tmp_path):
     recorder = SimulatedRecorder(stage_of(Character(creep=0.01, resonance=30.0, damping=0.1)))
-    outcome = calibrate(settings(tune=True, limits=(Limits(0.0, 100.0, 1000.0),)), recorder)
+    outcome = calibrate(settings(tune=True, limits=(Limits(0.0, 100.0, 1000.0),)), recorder, clock=lambda: recorder.now)
     loop = outcome.loops["x"]
     assert loop.design is not None and loop.design.bandwidth > 2.0
     assert [each.count for each in loop.steps] == [2, 2]

@@ -226,7 +226,7 @@ def test_the_zero_of_a_verification_is_that_of_the_sweep_before_its_path():
 @pytest.mark.slow
 def test_a_hidden_cause_is_named_and_undone(tmp_path):
     recorder, steps = SimulatedRecorder(stage_of(Character(creep=0.015))), []
-    outcome = calibrate(settings(), recorder, steps.append)
+    outcome = calibrate(settings(), recorder, steps.append, lambda: recorder.now)
     assert outcome.met and outcome.seconds <= outcome.settings.budget
     assert [effect.name for effect in outcome.diagnosis.axes["x"].effects] == ["creep"]
     error = outcome.errors["x"]
@@ -258,7 +258,7 @@ def test_a_sensor_that_is_slower_than_the_record_and_lost_messages_are_told(tmp_
             return replace(recording, record=record)
 
     recorder, progress = Held(stage_of(Character())), []
-    outcome = calibrate(settings(), recorder, progress.append)
+    outcome = calibrate(settings(), recorder, progress.append, lambda: recorder.now)
     assert outcome.met
     (lost,) = (step for step in outcome.steps if step.missing)
     assert lost.name == "02_calibration" and holds(lost.missing[0].text, 100)

@@ -37,8 +37,8 @@ class Wanted:
     loops: tuple[AxisLoop, ...] = ()  # feedback along the path; none: without
 
 
-# Settings, and the folder of bags and results.
-CalibrationRequest = tuple[CalibrationSettings, Path]
+# Settings, the folder of bags and results, and the time of the stage, s.
+CalibrationRequest = tuple[CalibrationSettings, Path, float]
 
 
 @dataclass(frozen=True)
@@ -55,9 +55,9 @@ class CalibrationOutcome:
 class CalibrationJob(WorkerProcess[CalibrationRequest, Progress | Wanted | CalibrationOutcome]):
     """A calibration in a worker process, which also tells its progress and the drives that it wants."""
 
-    def __init__(self, settings: CalibrationSettings, output: Path) -> None:
+    def __init__(self, settings: CalibrationSettings, output: Path, clock: float) -> None:
         what = "calibrator: the computation"
-        super().__init__(run_calibration, (settings, output), CalibrationOutcome, what, talks=True)
+        super().__init__(run_calibration, (settings, output, clock), CalibrationOutcome, what, talks=True)
 
     def recorded(self, off: str, clock: float) -> None:
         """Tell the worker that its drive is recorded, why feedback was switched off, and the time of the stage (s).
@@ -75,8 +75,8 @@ def run_calibration(request: CalibrationRequest, node: Connection) -> Calibratio
     from slpi_ros.reports.calibration import write_files
 
     threading.Thread(target=_end_with_parent, daemon=True).start()
-    settings, output = request
-    clock = _StageClock()
+    settings, output, begun = request
+    clock = StageClock(begun)
 
     def record(wanted: Request) -> Recording:
         kept = (output / wanted.name).exists()
@@ -98,24 +98,22 @@ def run_calibration(request: CalibrationRequest, node: Connection) -> Calibratio
     return CalibrationOutcome(format_model(outcome.model), outcome.met, outcome.why)
 
 
-class _StageClock:
+class StageClock:
     """Time of the stage (s), which may be simulated: as fast as between the last two times that it was set."""
 
-    def __init__(self) -> None:
-        self._set: tuple[float, float] | None = None  # time of the stage, and steady clock of this process, s
-        self._speed = 1.0
+    def __init__(self, now: float) -> None:
+        self._set, self._steady, self._speed = now, time.monotonic(), 1.0
 
     def set(self, now: float) -> None:
         """Set it to `now` (s)."""
         steady = time.monotonic()
-        if self._set and steady > self._set[1]:
-            self._speed = max(now - self._set[0], 0.0) / (steady - self._set[1])
-        self._set = now, steady
+        if steady > self._steady:
+            self._speed = max(now - self._set, 0.0) / (steady - self._steady)
+        self._set, self._steady = now, steady
 
     def __call__(self) -> float:
         """Return the time (s)."""
-        at, steady = self._set or (0.0, 0.0)
-        return at + self._speed * (time.monotonic() - steady)
+        return self._set + self._speed * (time.monotonic() - self._steady)
 
 
 def stage_of_kept(output: Path) -> str:

@@ -298,6 +298,11 @@ class Calibrator(Node):
         if job.done:
             self._end_job()
 
+    @property
+    def _drive_time(self) -> float:
+        """Time of the stage, seconds."""
+        return float(self._drive_clock.now().nanoseconds) * 1e-9
+
     def _end_job(self) -> None:
         """Complete the bag of the job, and tell the calibration."""
         job, self._job = self._job, None
@@ -306,7 +311,7 @@ class Calibrator(Node):
         self._guard.end()
         job.close(interrupted=self._failure is not None)
         if self._failure is None and self._worker is not None:
-            self._worker.recorded(job.loop.off if job.loop else "", self._drive_clock.now().nanoseconds * 1e-9)
+            self._worker.recorded(job.loop.off if job.loop else "", self._drive_time)
 
     # What is watched
 
@@ -350,7 +355,7 @@ class Calibrator(Node):
                 self._fail(error)
                 return
             self._returning, self._moved = True, now
-            self._worker = CalibrationJob(self._settings, self._output)
+            self._worker = CalibrationJob(self._settings, self._output, self._drive_time)
         elif overdue:
             self._fail(overdue)
         elif now - self._begun > self._patience:

@@ -23,7 +23,7 @@ from slpi_ros.io.record import Record  # noqa: E402
 from slpi_ros.io.tables import write_table  # noqa: E402
 from slpi_ros.io.unfinished_bags import partial_path  # noqa: E402
 from slpi_ros.model.document import parse_model  # noqa: E402
-from slpi_ros.nodes.calibration_job import PATH  # noqa: E402
+from slpi_ros.nodes.calibration_job import PATH, StageClock  # noqa: E402
 from slpi_ros.nodes.calibrator import DECLARATIONS, settings_of  # noqa: E402
 from slpi_ros.nodes.parameters import validated  # noqa: E402
 
@@ -242,6 +242,20 @@ def test_topics_may_be_remapped_in_a_namespace(tmp_path):
 
 
 @pytest.mark.ros
+def test_the_time_of_a_simulated_stage_goes_on_between_two_messages(monkeypatch):
+    steady = [100.0]
+    monkeypatch.setattr(time, "monotonic", lambda: steady[0])
+    clock = StageClock(5.0)
+    for passed, now, seen in [(10.0, 15.0, 15.0), (10.0, 35.0, 25.0), (5.0, 45.0, 45.0), (5.0, 45.0, 55.0)]:
+        steady[0] += passed
+        assert clock() == pytest.approx(seen)
+        clock.set(now)
+        assert clock() == pytest.approx(now)
+    # It stands: the simulation is paused.
+    steady[0] += 50.0
+    assert clock() == pytest.approx(45.0)
+
+
 def test_without_a_stage_it_ends(tmp_path):
     with started("calibrator", {**PARAMETERS, "output": str(tmp_path / "out"), "patience": 1.0}) as node:
         assert node.wait() == 1

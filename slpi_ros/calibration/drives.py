@@ -101,12 +101,12 @@ def compensated(
     sweep = exciting(settings, SWEEP, _sweep_seconds(settings), settings.axes, seed)
     swept = np.column_stack(list(sweep.voltage.values()))
     controller = Controller(settings.axes, settings.limits, period=1.0 / settings.rate)
-    controller.use_model(model, start_memory="wiped")
+    # The records begin at the start of the model; memory and creep go on from them.
+    controller.use_model(model, start_memory="start" if before else "wiped")
     dt = 1.0 / settings.rate
-    for axis in controller.axes if before else ():
-        if not axis.stream.timeless:
-            # Creep goes on from the records before.
-            t, voltage = driven_so_far(before)
+    if before:
+        t, voltage = driven_so_far(before)
+        for axis in controller.axes:
             for v, passed in zip(voltage[axis.name].tolist(), np.diff(t, prepend=t[0]).tolist(), strict=True):
                 axis.stream.drive(v, passed)
             axis.stream.wait(pause)
@@ -142,19 +142,12 @@ def compensated(
     return drive, {axis: np.pad(y, (0, drive.t.size - y.size), constant_values=np.nan) for axis, y in wanted.items()}
 
 
-def driven_so_far(
-    records: Sequence[Record], last_pause: float | None = None
-) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Return times (s) and voltages (V) of successive records; a long pause between them is shortened.
-
-    `last_pause`: that before the last record, s; default: by the stamps.
-    """
+def driven_so_far(records: Sequence[Record]) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Return times (s) and voltages (V) of successive records; a long pause between them is shortened."""
     known = [np.all([np.isfinite(v) for v in record.voltage.values()], axis=0) for record in records]
     time_ns = np.concatenate([record.time_ns[own] for record, own in zip(records, known, strict=True)])
-    steps = np.minimum(np.diff(time_ns, prepend=time_ns[0]) * 1e-9, LONGEST_PAUSE)
-    if last_pause is not None:
-        steps[-np.count_nonzero(known[-1])] = last_pause
-    return np.cumsum(steps), {
+    t = np.cumsum(np.minimum(np.diff(time_ns, prepend=time_ns[0]) * 1e-9, LONGEST_PAUSE))
+    return t, {
         axis: np.concatenate([record.voltage[axis][own] for record, own in zip(records, known, strict=True)])
         for axis in records[0].voltage
     }

@@ -359,16 +359,12 @@ class _Calibration:
 
     def _verify(self, model: StageModel) -> dict[str, TrackingError]:
         model = with_present_zero(model, self._records)
-        pause = self._pause
-        drive, desired = compensated(self._settings, model, len(self._steps), self._records, pause)
+        drive, desired = compensated(self._settings, model, len(self._steps), self._records, self._pause)
         recording = self._recorded(VERIFICATION_DRIVE, drive, desired)
-        # What the zero has done between two records is no error of the model, and after a reset ~/set_zero removes it,
-        # together with the creep of a pause that is not as the path assumes.
-        driven = [*self._records, before_path(recording)]
-        moved = moved_zeros(model, driven)
-        removed = moved if recording.kept else moved_zeros(model, driven, pause)
+        # What the zero has done between two records is no error of the model, and after a reset ~/set_zero removes it.
+        moved = moved_zeros(model, [*self._records, before_path(recording)])
         errors = {
-            axis: tracking_error(recording, axis, model, self._settings.goal(self._repeatability[axis]), removed[axis])
+            axis: tracking_error(recording, axis, model, self._settings.goal(self._repeatability[axis]), moved[axis])
             for axis in self._settings.axes
         }
         finding = "; ".join(
@@ -456,13 +452,10 @@ def before_path(recording: Recording) -> Record:
     return recording.record.part(slice(0, int(np.argmax(along))))
 
 
-def moved_zeros(model: StageModel, records: Sequence[Record], last_pause: float | None = None) -> dict[str, float]:
-    """Return by how much (m) the zero of each axis differs from the model in the last of the records.
-
-    `last_pause` as in `driven_so_far`.
-    """
+def moved_zeros(model: StageModel, records: Sequence[Record]) -> dict[str, float]:
+    """Return by how much (m) the zero of each axis differs from the model in the last of the records."""
     # The median over rising and falling voltages: lag, rate and width of the loops cancel.
-    t, voltage = driven_so_far(records, last_pause)
+    t, voltage = driven_so_far(records)
     seen = model.simulate(t, voltage)
     last = records[-1]
     known = np.all([np.isfinite(v) for v in last.voltage.values()], axis=0)

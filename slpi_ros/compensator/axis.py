@@ -368,7 +368,7 @@ class Axis:
             return
         low, high = self.stream.accepted
         expected = self.expected
-        x = self.loop.read(displacement, expected, now_ns, fresh, low <= displacement <= high, self.motion.resetting)
+        x = self.loop.read(displacement, expected, now_ns, fresh, low <= displacement <= high, self.motion.swing)
         self.check(displacement, "measured")
         if self.initial.assumed:
             if fresh:

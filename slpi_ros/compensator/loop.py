@@ -176,16 +176,16 @@ class Loop:
 
     # Readings
 
-    def read(self, y: float, expected: float, now_ns: int, fresh: bool, within: bool, resetting: bool = False) -> float:
+    def read(self, y: float, expected: float, now_ns: int, fresh: bool, within: bool, swing: int = 0) -> float:
         """Take a reading (m); return the displacement (m) without the sensor's own errors.
 
         `expected` (m) is where the model is. Only a `fresh` one, stamped now, counts for the zero, and only one
-        `within` the accepted displacements is corrected; `resetting`: in a reset, with a known memory.
+        `within` the accepted displacements is corrected; `swing`: of a reset, with a known memory.
         """
         x = self._sensor.correct(y) if within else y
         sensed = self._expected.span(now_ns) if self._expected else ()
         if fresh and isfinite(x):
-            self.offsets.take(x, sensed[-1] if sensed else expected, resetting, now_ns)
+            self.offsets.take(x, sensed[-1] if sensed else expected, swing, now_ns)
         return x
 
     def measure(self, x: float, expected: float, now_ns: int, watched: bool, tracking: TrackingStatistics) -> None:

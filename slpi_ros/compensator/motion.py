@@ -120,7 +120,7 @@ class Motion:
 
     kind = Kind.IDLE
     follows = drives = False  # setpoints, so that feedback corrects; the voltage without setpoints
-    resetting = False  # in a reset, from the first limit on, where the memory is known
+    swing = 0  # number of that over the range, from the first limit on, where the memory is known; 0: none
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
@@ -285,7 +285,7 @@ class Reset(Ramp):
         left = len(self._goals)
         v = super().next(pace, now_ns)
         self._low, self._high = min(self._low, v), max(self._high, v)
-        self.resetting = self.resetting or len(self._goals) < left
+        self.swing += left - len(self._goals)
         return v
 
     def end(self, axis: Moved, now_ns: int) -> None:

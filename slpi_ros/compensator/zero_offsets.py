@@ -9,9 +9,10 @@ from slpi_ros.io.messages import SECOND_NS
 
 # Most measurements for the offset of an axis, and how old they may be.
 OFFSETS, OFFSET_AGE_NS = 50, SECOND_NS // 5
-# Most measurements of a reset, the latest, and how long after it the zero is that of the reset, if nothing has moved:
-# time to call for it by hand.
-OF_RESET, RESET_AGE_NS = 100_000, 60 * SECOND_NS
+# The first swings of a reset, in which it covers nearly the whole range, so that another sensitivity does not count;
+# most measurements in them, the latest; how long after the reset the zero is that of these, if nothing has moved: time
+# to call for it by hand.
+SWINGS, OF_RESET, RESET_AGE_NS = 4, 100_000, 60 * SECOND_NS
 
 
 class ZeroOffsets:
@@ -22,10 +23,10 @@ class ZeroOffsets:
         # With the displacement of the model (m), until the axis moves otherwise.
         self._reset: deque[tuple[int, float, float]] = deque(maxlen=OF_RESET)
 
-    def take(self, reading: float, expected: float, resetting: bool, now_ns: int) -> None:
-        """Take a reading and the displacement of the model (m); `resetting`: in a reset, with a known memory."""
+    def take(self, reading: float, expected: float, swing: int, now_ns: int) -> None:
+        """Take a reading and the displacement of the model (m); `swing`: of a reset, with a known memory; 0: none."""
         self._recent.append((now_ns, reading - expected))
-        if resetting:
+        if 0 < swing <= SWINGS:
             self._reset.append((now_ns, reading - expected, expected))
 
     def leave_reset(self) -> None:
@@ -45,7 +46,7 @@ class ZeroOffsets:
     def present(self, now_ns: int) -> float | None:
         """Return the present offset (m); None without a measurement in the last 0.2 s.
 
-        Right after a reset it is that of the reset: what relaxes afterwards is not in it.
+        Right after a reset it is that of its first swings: what relaxes afterwards is not in it.
         """
         recent = self.latest(now_ns)
         if recent is not None and self._reset and now_ns - self._reset[-1][0] <= RESET_AGE_NS:

@@ -14,8 +14,11 @@ def best_of(runs: Sequence[plots.Run]) -> int:
     return int(np.argmin([np.abs(run.error).mean() for run in runs]))
 
 
-def kept(promised: float, runs: Sequence[plots.Run]) -> str:
-    """Return a sentence about the promised mean error (m) and that of the demo; where they differ, about the reason."""
+def kept(promised: float, without_offset: float, runs: Sequence[plots.Run]) -> str:
+    """Return a sentence about the promised mean error (m) and that of the demo; where they differ, about the reason.
+
+    `without_offset` (m): what is left of the promise without its offset, by which the zero moved along that path.
+    """
     run = runs[-1]
     mean = float(np.abs(run.error).mean())
     said = f" The calibrator promised a mean error of {promised * 1e9:.1f} nm; here it is {mean * 1e9:.1f} nm"
@@ -25,7 +28,8 @@ def kept(promised: float, runs: Sequence[plots.Run]) -> str:
     if promised / FACTOR <= mean <= promised * FACTOR and best is run:
         return f"{said}."
     if mean < promised and best is run:
-        return f"{said}, less than promised."
+        moved = f": the zero moved less than then, when {without_offset * 1e9:.1f} nm were left without that"
+        return f"{said}, less than promised{moved * (without_offset * FACTOR <= promised)}."
     # What may have changed since the calibration, by what it would leave of the error.
     still, passed = np.ones_like(run.t), run.t - run.t[0]
     causes = {

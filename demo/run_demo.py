@@ -61,24 +61,27 @@ def stage_simulator(seed: int, speed: float, warm_up: float = 0.0) -> AbstractCo
     return executable("stage_simulator", seed=seed, character="hidden", **given)
 
 
-def calibrate_itself(seed: int, folder: Path) -> tuple[float, float]:
+def calibrate_itself(seed: int, folder: Path) -> tuple[float, float, float]:
     """Let the calibrator calibrate the stage into a folder.
 
-    Return the mean error (m) that it found at last, and how long (s) the stage was switched on.
+    Return the mean error (m) that it found at last, that without its offset, and how long (s) the stage was on.
     """
     given = {"voltage_min": V_MIN, "voltage_max": V_MAX, "slew_limit": SLEW, "rate": RATE, "output": str(folder)}
-    promised, began = None, time.monotonic()
+    said, began = None, time.monotonic()
     node = executable("calibrator", log="info", listen=True, use_sim_time=True, **given)
     with stage_simulator(seed, SPEED), node as calibrator:
         for line in calibrator.stderr or ():
             print(line.decode(), end="", file=sys.stderr, flush=True)
-            promised = re.search(r"mean error ([\d.e-]+) (nm|µm)", line.decode()) or promised
+            # The last line tells the error without its offset, too.
+            said = re.search(r"mean error (\S+) (nm|µm)(?:.* without it (\S+) (nm|µm))?", line.decode()) or said
         calibrator.wait()
         on = SPEED * (time.monotonic() - began)
     # 1 says that the target was missed, and why; there is a model nevertheless.
-    if not promised or not (folder / "model.json").exists():
+    if not said or not (folder / "model.json").exists():
         raise SystemExit("demo: the calibration failed; the line above says why")
-    return float(promised[1]) * {"nm": 1e-9, "µm": 1e-6}[promised[2]], on
+    size, unit = [said[1], said[3] or said[1]], [said[2], said[4] or said[2]]
+    mean, rest = (float(each) * {"nm": 1e-9, "µm": 1e-6}[own] for each, own in zip(size, unit, strict=True))
+    return mean, rest, on
 
 
 def identify(bag: Path, model: Path, kind: str) -> None:
@@ -192,7 +195,7 @@ def main() -> int:
     print(f"stage {seed} (SEED={seed} repeats it) is calibrated, {SPEED:g} times as fast as in life", flush=True)
     calibration = options.output / "calibration"
     shutil.rmtree(calibration, ignore_errors=True)
-    promised, on = calibrate_itself(seed, calibration)
+    promised, without_offset, on = calibrate_itself(seed, calibration)
     [bag] = calibration.glob("*_calibration")
     with tempfile.TemporaryDirectory(prefix="slpi_demo_") as work:
         models = {name: Path(work) / f"{kind}.json" for kind, name in KINDS.items()}
@@ -203,7 +206,10 @@ def main() -> int:
         low, high = model.axes["x"].displacement_range
         print(f"following a new path of {options.path:g} s, {1 + len(models)} times", flush=True)
         runs = compared(seed, models, options.path, on)
-    rows, told = table_of(runs, high - low), hidden_and_found(seed, model) + kept(promised, runs) + out_of_reach(runs)
+    rows, told = (
+        table_of(runs, high - low),
+        hidden_and_found(seed, model) + kept(promised, without_offset, runs) + out_of_reach(runs),
+    )
     page = options.output / "report.html"
     write_page(page, seed, rows, runs, told, model)
     print()

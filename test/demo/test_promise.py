@@ -35,22 +35,24 @@ def test_the_best_row_is_that_with_the_smallest_error(demo, run):
 
 def test_a_reason_is_told_only_where_promise_and_run_differ(demo, run):
     kept, other = demo["promise"].kept, run("uncompensated", 1e-6)
-    assert "zero" not in kept(8e-9, [other, run("SLPI with causes", 0.0)])
+    assert "zero" not in kept(8e-9, 8e-9, [other, run("SLPI with causes", 0.0)])
     slope = np.gradient(Y, T)
     for error, cause, size in [
         (50e-9, "zero", 50.0), (8e-9 * T, "zero", 8.0),
         (-5e-3 * slope, "time", 5.0), (0.02 * (Y - Y.mean()), "sensitivity", 2.0),
     ]:  # fmt: skip
-        found = re.search(r"it is the (\w+)(.*):", kept(8e-9, [other, run("causes", error)]))
+        found = re.search(r"it is the (\w+)(.*):", kept(8e-9, 8e-9, [other, run("causes", error)]))
         sizes = [float(each) for each in re.findall(r"[\d.-]+", found[2])]
         assert found[1] == cause and size in [pytest.approx(each, rel=0.1) for each in sizes]
     # What none of them explains is said, and a computer that was too busy from some time on.
     bump = np.where((T > 6.0) & (T < 7.0), 250e-9, 0.0)
-    assert "None of" in kept(8e-9, [other, run("causes", bump)])
+    assert "None of" in kept(8e-9, 8e-9, [other, run("causes", bump)])
     busy = demo["plots"].Run("causes", T, Y, run("causes", bump).displacement, late=(6.0, 6.1))
     assert re.search(
-        r"it is the busy computer.* 2 setpoints .*6\.0 s.*: without it ([\d.]+)", kept(8e-9, [other, busy])
+        r"it is the busy computer.* 2 setpoints .*6\.0 s.*: without it ([\d.]+)", kept(8e-9, 8e-9, [other, busy])
     )
-    assert "it is" not in kept(80e-9, [other, run("causes", 0.0)]).split("here it is")[1]
+    for rest, moved in ((79e-9, False), (9e-9, True)):
+        told = kept(80e-9, rest, [other, run("causes", 0.0)])
+        assert "less than promised" in told and ("zero" in told and "9.0 nm" in told) == moved
     # The model with causes is as promised, but another one is better.
-    assert "with SLPI" in kept(8e-9, [other, run("SLPI", -0.2e-9), run("SLPI with causes", 1e-9)])
+    assert "with SLPI" in kept(8e-9, 8e-9, [other, run("SLPI", -0.2e-9), run("SLPI with causes", 1e-9)])

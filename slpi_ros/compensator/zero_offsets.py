@@ -1,6 +1,7 @@
 """Measured - model displacement of one axis, of the present and of the last reset, from which its zero is set."""
 
 from collections import deque
+from itertools import pairwise
 from statistics import median
 
 import numpy as np
@@ -9,10 +10,9 @@ from slpi_ros.io.messages import SECOND_NS
 
 # Most measurements for the offset of an axis, and how old they may be.
 OFFSETS, OFFSET_AGE_NS = 50, SECOND_NS // 5
-# The first swings of a reset, in which it covers nearly the whole range, so that another sensitivity does not count;
-# most measurements in them, the latest; how long after the reset the zero is that of these, if nothing has moved: time
-# to call for it by hand.
-SWINGS, OF_RESET, RESET_AGE_NS = 4, 100_000, 60 * SECOND_NS
+# Most measurements of a reset, the latest; least range of a swing that counts, as a share of the widest; how long after
+# the reset the zero is that of the reset, if nothing has moved: time to call for it by hand.
+OF_RESET, WIDE, RESET_AGE_NS = 100_000, 0.5, 60 * SECOND_NS
 
 
 class ZeroOffsets:
@@ -20,14 +20,14 @@ class ZeroOffsets:
 
     def __init__(self) -> None:
         self._recent: deque[tuple[int, float]] = deque(maxlen=OFFSETS)
-        # With the displacement of the model (m), until the axis moves otherwise.
-        self._reset: deque[tuple[int, float, float]] = deque(maxlen=OF_RESET)
+        # With the number of the swing and the displacement of the model (m), until the axis moves otherwise.
+        self._reset: deque[tuple[int, int, float, float]] = deque(maxlen=OF_RESET)
 
     def take(self, reading: float, expected: float, swing: int, now_ns: int) -> None:
         """Take a reading and the displacement of the model (m); `swing`: of a reset, with a known memory; 0: none."""
         self._recent.append((now_ns, reading - expected))
-        if 0 < swing <= SWINGS:
-            self._reset.append((now_ns, reading - expected, expected))
+        if swing:
+            self._reset.append((now_ns, swing, reading - expected, expected))
 
     def leave_reset(self) -> None:
         """Forget the reset: the axis moves otherwise."""
@@ -46,7 +46,7 @@ class ZeroOffsets:
     def present(self, now_ns: int) -> float | None:
         """Return the present offset (m); None without a measurement in the last 0.2 s.
 
-        Right after a reset it is that of its first swings: what relaxes afterwards is not in it.
+        Right after a reset it is that of its wide swings: what relaxes afterwards is not in it.
         """
         recent = self.latest(now_ns)
         if recent is not None and self._reset and now_ns - self._reset[-1][0] <= RESET_AGE_NS:
@@ -55,17 +55,22 @@ class ZeroOffsets:
         return recent
 
     def _of_reset(self) -> float | None:
-        """Return the offset (m) of the reset; None if the model has not moved both ways."""
-        t, offset, expected = np.array(self._reset).T
+        """Return the offset (m) of the reset; None without two wide swings one after the other."""
+        t, swing, offset, expected = np.array(self._reset).T
         t, first = np.unique(t, return_index=True)
         if t.size < 2:
             return None
-        velocity = np.gradient(expected[first], t)
-        # A reading that comes late by `T` is off by `-T` times the velocity, in the median of rising displacements and
-        # in that of falling ones: both agree on the zero.
-        up, down = velocity > 0.0, velocity < 0.0
-        if not (up.any() and down.any()):
-            return None
-        rising, falling = float(np.median(velocity[up])), float(np.median(velocity[down]))
-        above, below = float(np.median(offset[first][up])), float(np.median(offset[first][down]))
-        return (below * rising - above * falling) / (rising - falling)
+        swing, offset, expected = swing[first], offset[first], expected[first]
+        velocity, swings = np.gradient(expected, t), []
+        for number in np.unique(swing):
+            own = swing == number
+            swings.append((np.ptp(expected[own]), float(np.median(velocity[own])), float(np.median(offset[own]))))
+        widest = max(swings)[0]
+        # A reading that comes late by `T` is off by `-T` times the velocity: a swing up and one down agree on the zero.
+        # Both have the same range, so that another sensitivity does not move it.
+        zeros = [
+            (before * down - after * up) / (down - up)
+            for (one, up, before), (other, down, after) in pairwise(swings)
+            if min(one, other) >= WIDE * widest and up * down < 0.0
+        ]
+        return median(zeros) if zeros else None

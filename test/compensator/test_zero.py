@@ -164,7 +164,7 @@ def test_readings_that_come_late_do_not_move_the_zero_of_a_reset(late):
     assert moved == {name: pytest.approx(moved, abs=20e-9) for name, moved in MOVED.items()}
 
 
-def test_right_after_a_reset_the_zero_is_that_of_its_first_swings():
+def test_right_after_a_reset_the_zero_is_that_of_its_swings():
     bench = Bench(PLAIN)
     bench.sample(0.2)
     controller = bench.controller

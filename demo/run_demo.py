@@ -72,15 +72,14 @@ def calibrate_itself(seed: int, folder: Path) -> tuple[float, float, float]:
     with stage_simulator(seed, SPEED), node as calibrator:
         for line in calibrator.stderr or ():
             print(line.decode(), end="", file=sys.stderr, flush=True)
-            # The last line tells the error without its offset, too.
-            said = re.search(r"mean error (\S+) (nm|µm)(?:.* without it (\S+) (nm|µm))?", line.decode()) or said
+            # Of the last verification: with and without its offset.
+            said = re.search(r"mean error (\S+) (nm|µm) .* without it (\S+) (nm|µm)", line.decode()) or said
         calibrator.wait()
         on = SPEED * (time.monotonic() - began)
     # 1 says that the target was missed, and why; there is a model nevertheless.
     if not said or not (folder / "model.json").exists():
         raise SystemExit("demo: the calibration failed; the line above says why")
-    size, unit = [said[1], said[3] or said[1]], [said[2], said[4] or said[2]]
-    mean, rest = (float(each) * {"nm": 1e-9, "µm": 1e-6}[own] for each, own in zip(size, unit, strict=True))
+    mean, rest = (float(said[k]) * {"nm": 1e-9, "µm": 1e-6}[said[k + 1]] for k in (1, 3))
     return mean, rest, on
 
 
@@ -206,10 +205,8 @@ def main() -> int:
         low, high = model.axes["x"].displacement_range
         print(f"following a new path of {options.path:g} s, {1 + len(models)} times", flush=True)
         runs = compared(seed, models, options.path, on)
-    rows, told = (
-        table_of(runs, high - low),
-        hidden_and_found(seed, model) + kept(promised, without_offset, runs) + out_of_reach(runs),
-    )
+    rows = table_of(runs, high - low)
+    told = hidden_and_found(seed, model) + kept(promised, without_offset, runs) + out_of_reach(runs)
     page = options.output / "report.html"
     write_page(page, seed, rows, runs, told, model)
     print()

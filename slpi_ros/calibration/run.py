@@ -10,14 +10,7 @@ import numpy as np
 from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.calibration.choice import next_drive
 from slpi_ros.calibration.closed_loop import RASTER, AxisLoop, LoopResult, loops_of, moving, showing, too_slow
-from slpi_ros.calibration.drives import (
-    LONGEST_PAUSE,
-    SWEEP_SECONDS,
-    checking,
-    compensated,
-    driven_so_far,
-    exciting,
-)
+from slpi_ros.calibration.drives import LONGEST_PAUSE, SWEEP_SECONDS, checking, compensated, driven_so_far, exciting
 from slpi_ros.calibration.kept import FOLLOWS, naming, require_kept
 from slpi_ros.calibration.settings import CALIBRATION, CalibrationSettings
 from slpi_ros.compensator.loop_design import design

@@ -10,8 +10,9 @@ from slpi_ros.io.messages import SECOND_NS
 
 # Most measurements for the offset of an axis, and how old they may be.
 OFFSETS, OFFSET_AGE_NS = 50, SECOND_NS // 5
-# Most measurements of a reset, the latest; least range of a swing that counts, as a share of the widest; how long after
-# the reset the zero is that of the reset, if nothing has moved: time to call for it by hand.
+# Most measurements of a reset, the latest; least range of a swing that counts, as a share of the widest: a changed
+# sensitivity moves the others further; how long after the reset the zero is that of the reset, if nothing has moved:
+# time to call for it by hand.
 OF_RESET, WIDE, RESET_AGE_NS = 100_000, 0.5, 60 * SECOND_NS
 
 
@@ -65,9 +66,8 @@ class ZeroOffsets:
         for number in np.unique(swing):
             own = swing == number
             swings.append((np.ptp(expected[own]), float(np.median(velocity[own])), float(np.median(offset[own]))))
-        widest = max(swings)[0]
+        widest = max(extent for extent, _, _ in swings)
         # A reading that comes late by `T` is off by `-T` times the velocity: a swing up and one down agree on the zero.
-        # Both have the same range, so that another sensitivity does not move it.
         zeros = [
             (before * down - after * up) / (down - up)
             for (one, up, before), (other, down, after) in pairwise(swings)

@@ -266,9 +266,9 @@ def read_table_with(
 
 def _in_another_unit(names: Sequence[str], quantity: ColumnQuantity) -> tuple[dict[str, str], float]:
     """Return the columns ``<axis>_<unit>`` of the first unit of which there are any, by axis, and its SI value."""
+    parts = [(name, *name.rpartition("_")) for name in names]
     for unit, scale in quantity.units.items():
-        parts = {name: name.rpartition("_") for name in names}
-        if found := {axis: name for name, (axis, _, end) in parts.items() if axis and quantity.unit(end) == unit}:
+        if found := {axis: name for name, axis, _, end in parts if axis and quantity.unit(end) == unit}:
             return found, scale
     return {}, 1.0
 

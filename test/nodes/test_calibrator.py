@@ -241,7 +241,6 @@ def test_topics_may_be_remapped_in_a_namespace(tmp_path):
     require_safe(stage)
 
 
-@pytest.mark.ros
 def test_the_time_of_a_simulated_stage_goes_on_between_two_messages(monkeypatch):
     steady = [100.0]
     monkeypatch.setattr(time, "monotonic", lambda: steady[0])
@@ -256,6 +255,7 @@ def test_the_time_of_a_simulated_stage_goes_on_between_two_messages(monkeypatch)
     assert clock() == pytest.approx(45.0)
 
 
+@pytest.mark.ros
 def test_without_a_stage_it_ends(tmp_path):
     with started("calibrator", {**PARAMETERS, "output": str(tmp_path / "out"), "patience": 1.0}) as node:
         assert node.wait() == 1

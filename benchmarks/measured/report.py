@@ -72,10 +72,10 @@ def readme_table(rows: Rows, manifest: Manifest, date: str, command: str) -> str
     said = (
         f"Rms error without its mean, in % of the range of the data, none of which were fitted; {date}, `{command}`. "
         f"**Bold**: the least of {count} methods; *as good*: no significant difference to it (95 %); *line*: a "
-        f"straight line. One row for each device: its middle one by *SLPI, causes* over the best other method, of two "
-        f"the worse.\n\n"
-        f"{headline(rows, of_piezos(manifest))} [All {len(rows)} rows, all methods, with intervals]"
-        f"(docs/explanation/measured.md)."
+        f"straight line. One row for each device whose motion was measured: the one with the middle ratio of *SLPI, "
+        f"causes* to the best other method; of two the worse.\n\n"
+        f"{headline(rows, of_piezos(manifest))} {inverses(rows, of_piezos(manifest))} [All {len(rows)} rows, all "
+        f"methods, with intervals](docs/explanation/measured.md)."
     )
     return "\n".join([*lines, "", said])
 
@@ -135,6 +135,20 @@ def headline(rows: Rows, piezos: Sequence[str]) -> str:
         f"{compared({label: rows[label] for label in piezos})}. Over PI, in all rows: {compared(rows, ['PI'])}. The "
         f"causes make SLPI clearly better in {causes.wins} rows and worse in {causes.losses}, at worst by a factor of "
         f"{max(causes.ratios):.2f} (offset included {max(causes.absolute):.2f})."
+    )
+
+
+def inverses(rows: Rows, piezos: Sequence[str]) -> str:
+    """Return a sentence with the ratios of the errors of the inverse: to the best other method of each row, to PI."""
+    over_best, over_pi = [], []
+    for row in (rows[label] for label in piezos):
+        errors = {name: float(cell["inverse"]) for name, cell in row.items() if "inverse" in cell}
+        over_best.append(errors["SLPI, causes"] / min(error for name, error in errors.items() if "SLPI" not in name))
+        over_pi.append(errors["SLPI, causes"] / errors["PI"])
+    return (
+        f"The **voltage** that is computed for the measured displacement of these {len(over_best)} rows is off by "
+        f"{np.median(over_best):.2f} times (median; worst {max(over_best):.2f}) as much as that of the best other "
+        f"method, by {np.median(over_pi):.2f} times (worst {max(over_pi):.2f}) as much as that of PI."
     )
 
 

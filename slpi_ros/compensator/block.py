@@ -20,6 +20,8 @@ from slpi_ros.model.streaming import StageStream
 
 # Most samples of a block: their voltages take some seconds to compute.
 LONGEST = 300_000
+# Relative rounding error of the steps of a block.
+ROUNDING = 1e-9
 # A driver answers within this time; while it plays, it tells the sample that often.
 PATIENCE_NS = 2 * SECOND_NS
 # What the driver may tell of a block.
@@ -163,6 +165,17 @@ class BlockFollower(Rule):
     def done(self) -> bool:
         """Whether the driver has told its end."""
         return self.state in (REFUSED, ENDED, STOPPED)
+
+    @property
+    def beyond_limits(self) -> bool:
+        """Whether voltages that are still to be played, or their rates, are beyond the present limits of an axis."""
+        rest = np.array(self._rows[max(self.sample - 1, 0) :])
+        for v, axis in zip(rest.T, self._axes, strict=True):
+            limits = axis.limits
+            steps, most = np.abs(np.diff(v)), limits.slew * self.block.period
+            if v.min() < limits.lower or v.max() > limits.upper or (steps > most * (1.0 + ROUNDING)).any():
+                return True
+        return False
 
     def check(self, now_ns: int) -> Finding | None:
         """Return why nothing more is known of the block, None while the driver tells it."""

@@ -3,6 +3,7 @@
 import random
 from collections.abc import Callable, Sequence
 
+from slpi_ros.compensator.block import PATIENCE_NS
 from slpi_ros.compensator.monitor import Finding, Rule
 from slpi_ros.io.messages import SECOND_NS
 
@@ -34,7 +35,6 @@ class Listening(Rule):
     """
 
     def __init__(self, others: Callable[[], Sequence[str]], found_from_ns: int = 0) -> None:
-        self.playing = False  # a driver plays a block
         self.thorough = True  # nothing moves before the middleware has found everybody, on a busy machine too
         self._others = others
         self._beside: Sequence[str] = ()  # the others at the last look
@@ -46,6 +46,7 @@ class Listening(Rule):
         self.on = True  # voltages of others are heard
         self._begun_ns = self._begun_ns or now_ns
         self._heard_ns: int | None = None
+        self._played_ns: int | None = None  # when a driver has told last that it plays a block
         self.give_way(now_ns)
 
     def give_way(self, now_ns: int) -> None:
@@ -61,6 +62,10 @@ class Listening(Rule):
         """Take a voltage that somebody else has commanded."""
         self._heard_ns = now_ns
 
+    def play(self, plays: bool, now_ns: int) -> None:
+        """Take whether a driver plays a block; it goes on telling so, or it has ended itself."""
+        self._played_ns = now_ns if plays else None
+
     def check(self, now_ns: int) -> Finding | None:
         """Return what holds the first voltage back, None if nothing does."""
         others = self._others()
@@ -68,7 +73,7 @@ class Listening(Rule):
             self._known_ns = now_ns
         self._beside = others
         named = ", ".join(others) or "another node"
-        if self.playing:
+        if self._played_ns is not None and now_ns - self._played_ns < PATIENCE_NS:
             return self._finding("the driver plays a block; wait for its end")
         if self._heard_ns is not None and now_ns - self._heard_ns < QUIET_NS:
             return self._finding(f"{named} commands the stage; end it, or do not use this node")

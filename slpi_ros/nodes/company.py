@@ -88,6 +88,11 @@ class Company:
         if self.listens and data not in self.own:
             self._listening.hear(time.monotonic_ns())
 
+    @property
+    def several_report(self) -> bool:
+        """Whether ``stage_state`` has more than one publisher."""
+        return self._reporters > 1
+
     def heard(self, now_ns: int) -> None:
         """Take that the stage has reported."""
         self._listening.state(now_ns)

@@ -135,6 +135,11 @@ class Compensator(LifecycleNode):
 
     def _use_settings(self, new: CompensatorSettings) -> None:
         self._controller.use_limits(new.limits, time.monotonic_ns(), new.period)
+        if self._controller.block_beyond_limits:
+            # What the device has not played yet was checked with other limits; from where it stops the voltage goes
+            # inside.
+            self.get_logger().warning("the block that the device plays is beyond the new limits: it is stopped")
+            self._output.stop_block()
         for axis, loop in zip(self._controller.axes, new.loops, strict=True):
             axis.retune(loop)
         self._controller.messages.use(new.time)
@@ -321,7 +326,9 @@ class Compensator(LifecycleNode):
     def _on_state(self, data: bytes) -> None:
         """Take the voltages that the amplifiers report."""
         controller, now_ns = self._controller, time.monotonic_ns()
-        if controller.ownership.started and now_ns - self._reported_ns < REPORT_NS:
+        # Of several publishers each has axes of its own: none of them hides another one.
+        soon = now_ns - self._reported_ns < REPORT_NS and not self._company.several_report
+        if controller.ownership.started and soon:
             return
         self._reported_ns = now_ns
         if (state := read_state(data)) is None:

@@ -95,7 +95,7 @@ class Paths:
         """Take what a driver tells of a block."""
         listening = self._controller.ownership.listening
         if listening:
-            listening.playing = status.message in (ACCEPTED, PLAYING)
+            listening.play(status.message in (ACCEPTED, PLAYING), time.monotonic_ns())
         values = {each.key: each.value for each in status.values}
         seconds, _, rest = values.get("stamp", "").partition(".")
         if not (seconds.isdecimal() and rest.isdecimal() and values.get("sample", "").isdecimal()):

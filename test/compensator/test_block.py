@@ -162,6 +162,43 @@ def test_reports_of_a_block_are_no_other_hand():
     assert made.ownership.owned
 
 
+@pytest.mark.parametrize(
+    ("limits", "beyond"),
+    [
+        (Limits(0.0, 100.0, SLEW), False),
+        (Limits(0.0, 1.0, SLEW), True),
+        (Limits(0.0, 100.0, 0.5 * SLEW), True),
+        (Limits(0.0, 100.0, 2.0 * SLEW), False),
+    ],
+)
+def test_limits_that_come_while_a_block_is_played_hold_for_the_rest_of_it(limits, beyond):
+    made = prepared()
+    block, _ = block_of(made)
+    made.hear_block(STAMP, PLAYING, 5, "", 3 * 10**9)
+    made.use_limits([limits], 3 * 10**9, PERIOD)
+    assert made.block_beyond_limits is beyond
+    # What has been played counts no more.
+    made.use_limits([replace(limits, upper=100.0)], 3 * 10**9, PERIOD)
+    made.hear_block(STAMP, PLAYING, len(block.voltages), "", 3 * 10**9)
+    assert not made.block_beyond_limits
+
+
+def test_after_a_block_the_voltage_goes_inside_limits_that_have_come_meanwhile():
+    made = prepared()
+    block, _ = block_of(made)
+    end = float(block.voltages[-1, 0])
+    made.use_limits([Limits(0.0, end - 5.0, SLEW)], 3 * 10**9, PERIOD)
+    now = 4 * 10**9
+    assert made.hear_block(STAMP, ENDED, len(block.voltages), "", now) and made.voltages[0] == end
+    given = [end]
+    while made.next_due_ns(now, now) is not None and len(given) < 1000:
+        now = max(now + 1, made.next_due_ns(now, now))
+        made.advance(now, now)
+        given.append(made.voltages[0])
+    assert given[-1] == end - 5.0
+    assert np.abs(np.diff(given)).max() <= 2.0 * SLEW * PERIOD * (1.0 + 1e-9)
+
+
 def test_an_axis_that_is_not_named_stays_and_effects_go_on():
     model = axis_model()
     slow = replace(model, effects=(Creep((0.5,), (0.03,)),))

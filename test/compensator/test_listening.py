@@ -4,6 +4,7 @@ import random
 
 import pytest
 
+from slpi_ros.compensator.block import PATIENCE_NS
 from slpi_ros.compensator.listening import LOOK_NS, LOOK_WITHOUT_NS, QUIET_NS, RANDOM_NS, Listening
 
 MS = 1_000_000
@@ -77,10 +78,18 @@ def test_a_voltage_of_somebody_whom_the_graph_does_not_know_counts():
 def test_a_block_that_is_played_holds_it_back():
     rule = listening()
     rule.state(BEGIN)
-    rule.playing = True
+    rule.play(True, BEGIN + 19_000 * MS)
     assert rule.check(BEGIN + 20_000 * MS) is not None
-    rule.playing = False
+    rule.play(False, BEGIN + 20_000 * MS)
     assert rule.check(BEGIN + 20_000 * MS) is None
+
+
+def test_a_driver_that_has_died_plays_no_block():
+    rule = listening()
+    rule.state(BEGIN)
+    rule.play(True, BEGIN + 19_000 * MS)
+    assert rule.check(BEGIN + 19_000 * MS + PATIENCE_NS - MS) is not None
+    assert rule.check(BEGIN + 19_000 * MS + PATIENCE_NS) is None
 
 
 def test_two_that_begin_together_do_not_decide_alike():

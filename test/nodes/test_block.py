@@ -126,6 +126,15 @@ def test_a_path_is_played_by_the_clock_of_the_device_and_what_was_recorded_comes
     assert status.level < DiagnosticStatus.ERROR
 
 
+def test_a_limit_that_is_lowered_meanwhile_stops_it_and_the_voltage_goes_inside(bench):
+    bench.send(path(bench.model, 3.0, 1e-3), 1e-3)
+    bench.until("playing")
+    lowest = min(point.effort[0] for point in bench.blocks[0].points[500:])
+    assert bench.graph.set_parameters("/compensator", voltage_max=lowest - 1.0) == ""
+    assert int(bench.until("stopped")["sample"]) < len(bench.blocks[0].points)
+    bench.graph.spin_until(lambda: bench.states[-1].effort[0] <= lowest - 1.0 + 1e-5, "the voltage inside the limits")
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("how", ["empty", "stop"])
 def test_it_is_stopped_where_it_is(bench, how):

@@ -93,6 +93,29 @@ def test_two_publishers_of_different_axes_are_two_drivers(model_file):
         client.graph.spin_until(lambda: insist(client, 0.1), "a voltage")
 
 
+def test_who_moves_the_axis_of_a_driver_that_reports_right_after_another_one_is_noticed(tmp_path):
+    path = tmp_path / "model.json"
+    save_model(stage_model(("x", "y")), path)
+    with compensator(model_file=str(path), start_voltage="auto", axes=["x", "y"], voltage_max=[100.0] * 2,
+                     voltage_min=[0.0] * 2, slew_limit=[0.0] * 2) as client:  # fmt: skip
+        node, moved = client.graph.node, []
+        drivers = [node.create_publisher(JointState, "/stage_state", RELIABLE) for _ in range(2)]
+
+        def publish():
+            # One right after the other, always in this order.
+            at = client.answers[-1] if client.answers else [0.0, 0.0]
+            for driver, axis, v in zip(drivers, ("x", "y"), (at[0], at[1] + sum(moved)), strict=True):
+                driver.publish(JointState(name=[axis], position=[0.0], effort=[v]))
+
+        node.create_timer(0.01, publish)
+        client.graph.spin_until(lambda: insist(client, 0.1), "a voltage")
+        client.graph.spin_for(1.5)
+        # For 2 s only: none of some 200 reports may be missed for long.
+        moved.append(20.0)
+        node.create_timer(2.0, moved.clear)
+        wait_for_obstacle(client, "axis 'y'", "~/arm")
+
+
 def test_a_voltage_that_somebody_repeats_holds_the_first_one_back(model_file):
     with compensator(model_file=model_file, start_voltage="auto") as client:
         reporting(client, rate=50.0)

@@ -95,7 +95,10 @@ def main() -> None:
         print(f"{seed:4d} {a:11.4f} {b:6.3f} {c:11.3f} {d:6.2f} {ratio:7.0f} {100 * after:14.4f} ({100 * without:.4f})")
     if options.keep:
         least, most = np.min(columns, axis=0), np.max(columns, axis=0)
-        what = f"{options.seeds} simulated stages, mean and maximum error on a new path, % of stroke; the same with PI"
+        what = (
+            f"{options.seeds} simulated stages, mean and maximum absolute error on a new path, % of stroke; the same "
+            "with PI"
+        )
         spans = [
             f"{low:.{digits}f}-{high:.{digits}f} %" for low, high, digits in zip(least, most, (3, 2, 2, 1), strict=True)
         ]

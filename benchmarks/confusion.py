@@ -54,7 +54,8 @@ SAMPLES = 40_000
 MEANT = {
     "single": "simulated stages with one hidden effect: that one named or among the alternatives, and no other",
     "pair": "simulated stages with two hidden effects: both named or among the alternatives, and no other",
-    "simulator": "stages of the package's own simulator with creep and a lag: the same",
+    "simulator": "stages of the package's own simulator with creep and a lag: both named or among the alternatives, "
+    "and no other",
     "clean": "simulated stages without a hidden effect: an effect named",
     "unknown": f"simulated stages with one of {len(KINDS)} causes that no effect describes: a wrong name, or no "
     "report of the remaining error",

@@ -340,9 +340,10 @@ def keep(stages: Mapping[int, tuple[Specimen, Mapping[str, Any]]], passes: int) 
     noise = [1e9 * one.noise for one in specimens]
     what = (
         f"a raster of 20 Hz that repeats, {len(stages)} stages with modes of {min(modes):.0f} to {max(modes):.0f} Hz "
-        f"and {min(noise):.0f} to {max(noise):.0f} nm of noise, rms error, median (least to largest): inverse alone; "
-        f"feedback; `learn`, {passes} passes; learning from the inverse without a model of the dynamics (this and the "
-        "feedback with the best of several gains)"
+        f"and {min(noise):.0f} to {max(noise):.0f} nm of noise, rms error, median (least to largest): inverse alone, "
+        "first pass; with a proportional-integral loop, the best of six gains, drift included (not `slpi tune`); "
+        f"`learn`, {passes} passes; learning from the inverse without a model of the dynamics, the best of several "
+        "gains"
     )
     columns = [[one["learner"][0] for one in errors]]
     columns += [[one[method][-1] for one in errors] for method in ("PI", "learner", "inverse")]

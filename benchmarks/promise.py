@@ -233,9 +233,9 @@ def main() -> None:
     )
     if options.keep:
         what = (
-            "calibrator, stages with one or two hidden effects: all causes found; mean error that it promises, of "
-            f"stroke, median; kept within a factor of {FACTOR:g} five minutes later, after a reset and after a "
-            "restart; told that zero or sensitivity go on moving"
+            "calibrator, stages with one or two hidden effects: all causes found; mean absolute error that it "
+            f"promises, of stroke, median; found within a factor of {FACTOR:g} of it, either way, five minutes later, "
+            "after a reset and after a restart; of the others, told that zero or sensitivity go on moving"
         )
         whole = options.stages
         said = f"{right} of {whole}; {100.0 * error:.3f} %; {good} of {whole}; {told} of the other {whole - good}"

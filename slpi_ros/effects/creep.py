@@ -289,10 +289,14 @@ class StreamingCreep(StreamingEffect):
 
     def start(self, x: float) -> None:
         """Initialise to equilibrium at `x` (m)."""
-        origin = self._creep.anchored(x).origin
-        self._origin = x if isinf(origin) else origin
+        self._origin = x if self._from_start else self._creep.origin
         self._input = x - self._origin
         self._states = [self._input] * len(self._gains)
+
+    @property
+    def _from_start(self) -> bool:
+        """Whether the motion counts from where it has started."""
+        return isinf(self._creep.origin) or not isinf(self._creep.exponent)
 
     def forward(self, dt: float, x: float) -> float:
         """Advance by `dt` (s) to the displacement `x` (m) and return the displacement with creep (m)."""
@@ -315,8 +319,11 @@ class StreamingCreep(StreamingEffect):
 
     def resume(self, other: "StreamingCreep", x: float) -> None:
         """Take over the state of another model's creep at the input `x` (m)."""
-        # Relaxations with a time constant that `other` has, too, continue; all others start in equilibrium.
+        # Relaxations with a time constant that `other` has, too, continue; all others start in equilibrium. What counts
+        # from its start goes on counting from there.
         self.start(x)
+        if self._from_start:
+            self._origin, self._input = x - other._input, other._input
         known = dict(zip(other._creep.chain[0].tolist(), other._states, strict=True))
         taus = self._creep.chain[0].tolist()
         self._states = [self._input + known.get(tau, other._input) - other._input for tau in taus]
@@ -331,12 +338,18 @@ class StreamingCreep(StreamingEffect):
 
     @property
     def relaxing(self) -> tuple[float, ...]:
-        """Distances (m) of the relaxations from equilibrium."""
-        return tuple(state - self._input for state in self._states)
+        """Distances (m) of the relaxations from equilibrium; of motion that counts from its start, that motion too."""
+        moved = (self._input,) if self._from_start else ()
+        return (*(state - self._input for state in self._states), *moved)
 
     def relax_from(self, distances: Sequence[float]) -> None:
-        """Continue from distances (m) from equilibrium, one for each relaxation; others are ignored."""
-        if len(distances) == len(self._states):
+        """Continue from what `relaxing` has returned, or from the distances alone; others are ignored."""
+        count = len(self._states)
+        if self._from_start and len(distances) == count + 1:
+            self._origin += self._input - distances[count]
+            self._input = distances[count]
+            distances = distances[:count]
+        if len(distances) == count:
             self._states = [self._input + distance for distance in distances]
 
     def _crept(self) -> float:

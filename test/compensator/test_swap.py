@@ -4,13 +4,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
+from effects.cases import BY_NAME
 from strategies import FAMILY_CASE, axis_model, axis_models, cases_and_paths, stream_forward
 
 from slpi_ros.compensator.axis import Axis
 from slpi_ros.compensator.controller import OPEN_LOOP
 from slpi_ros.compensator.model_swap import take_over, turning_voltages
+from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.lag import Lag
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.hysteresis.shapes import FAR
@@ -34,6 +36,28 @@ def test_a_replayed_memory_goes_on_as_the_one_that_was_there(drawn, shares):
     scale = 1e-9 * case.width * case.slopes[1]
     assert stream.memory.displacement == pytest.approx(memory.displacement, abs=scale)
     np.testing.assert_allclose(stream_forward(stream.memory, further), stream_forward(memory, further), atol=scale)
+
+
+# What settles soon is at rest: nothing moves while a zero is set.
+SLOW = st.sampled_from(sorted(set(BY_NAME) - {"lag", "resonance", "slew"})).flatmap(BY_NAME.__getitem__)
+
+
+@given(SLOW, st.lists(st.tuples(st.floats(0.0, 1.0), st.floats(1e-3, 5.0)), min_size=2, max_size=20))
+@example(Creep(exponent=0.1, gain=0.05), [(1.0, 1.0), (0.0, 1.0)])
+@example(Creep((2.0,), (0.05,)), [(1.0, 1.0), (0.0, 1.0)])
+def test_with_another_zero_each_effect_goes_on_where_it_was(effect, moves):
+    """A zero that moves (m) moves the displacement, now and later, and nothing else: in no effect anything is lost."""
+    by, axis = 0.3e-6, replace(axis_model(FAMILY_CASE), voltage_range=(-1e4, 1e4), effects=(effect,))
+    low, high = FAMILY_CASE.span[0], FAMILY_CASE.span[0] + FAMILY_CASE.width
+    stream = take_over(axis, OPEN, ())
+    half = len(moves) // 2
+    for share, dt in moves[:half]:
+        stream.drive(low + share * (high - low), dt)
+    after = take_over(axis.shifted(by), OPEN, turning_voltages(stream.memory))
+    after.resume(stream)
+    for share, dt in [(None, 0.0), *moves[half:]]:
+        v = stream.voltage if share is None else low + share * (high - low)
+        assert after.drive(v, dt) - by == pytest.approx(stream.drive(v, dt), abs=1e-12)
 
 
 @given(axis_models(), axis_models(), st.lists(st.floats(0.0, 1.0), min_size=1, max_size=12))

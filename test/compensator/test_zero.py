@@ -19,6 +19,10 @@ LIMITS = [Limits(0.0, 100.0, 2000.0)] * 2
 PLAIN = two_axes()
 EFFECTS = {"x": (Creep((0.1, 1.0), (0.02, 0.02)), CrossCoupling({"y": 0.02})), "y": (CrossCoupling({"x": -0.03}),)}
 RICH = replace(PLAIN, axes={name: replace(axis, effects=EFFECTS[name]) for name, axis in PLAIN.axes.items()})
+# It counts from where it has started.
+POWER = replace(
+    PLAIN, axes={name: replace(axis, effects=(Creep(exponent=0.1, gain=0.05),)) for name, axis in PLAIN.axes.items()}
+)
 RANGES = [(2e-6, 12e-6), (0.0, 15e-6)]
 MOVED = {"x": 0.4e-6, "y": -0.7e-6}
 
@@ -55,7 +59,7 @@ class Bench:
         return np.array([self.sample(place) for place in np.linspace(begin, end, count)])
 
 
-@pytest.mark.parametrize("model", [PLAIN, RICH], ids=["hysteresis", "creep and coupling"])
+@pytest.mark.parametrize("model", [PLAIN, RICH, POWER], ids=["hysteresis", "creep and coupling", "a power of time"])
 @pytest.mark.parametrize("feedback", [False, True], ids=["alone", "feedback"])
 def test_the_zero_of_the_sensor_becomes_that_of_the_model_and_nothing_moves(model, feedback):
     bench = Bench(model, feedback=feedback)
@@ -104,8 +108,9 @@ def test_a_sensor_whose_zero_is_anywhere_can_be_used():
     bench.controller.update(bench.now_ns + MS, ["x"], [y + 1e-6], bench.now_ns + MS)
 
 
-def test_it_outlives_a_restart_but_not_another_model(tmp_path):
-    bench = Bench(PLAIN)
+@pytest.mark.parametrize("model", [PLAIN, POWER], ids=["hysteresis", "a power of time"])
+def test_it_outlives_a_restart_but_not_another_model(tmp_path, model):
+    bench = Bench(model)
     bench.run(0.1, 0.5)
     bench.controller.set_zero(bench.now_ns)
     bench.run(0.5, 0.2)
@@ -114,15 +119,16 @@ def test_it_outlives_a_restart_but_not_another_model(tmp_path):
     saved = {axis.name: axis.saved(bench.now_ns) for axis in axes}
     file.save(bench.controller.identified, saved, complete=False)
     found = load_memory(tmp_path / "memory.json")
-    found.require_fit(PLAIN, NAMES)
+    found.require_fit(model, NAMES)
     again = found.axes
     assert {name: axis.zero for name, axis in again.items()} == {axis.name: axis.zero for axis in axes}
     other = Controller(NAMES, LIMITS)
-    other.use_model(PLAIN, again)
+    other.use_model(model, again)
     for one, before in zip(other.axes, axes, strict=True):
         assert one.zero == before.zero
         told = one.stream.uncoupled_displacement
-        assert told == pytest.approx(before.stream.uncoupled_displacement, abs=1e-12)
+        # Saved distances are rounded to 0.1 nm; meanwhile it has crept on.
+        assert told == pytest.approx(before.stream.uncoupled_displacement, abs=1e-12 if model is PLAIN else 2e-9)
     other.use_model(RICH)
     assert {axis.zero.source for axis in other.axes} == {CALIBRATION}
 

@@ -104,6 +104,7 @@ def test_a_file_by_somebody_else_and_the_model_stay(folder, tmp_path, capsys):
         assert str(output) in capsys.readouterr().err and output.read_bytes() == before
 
 
+@pytest.mark.long
 def test_a_measured_response_is_shown_beside_the_model_and_used(folder, tmp_path, capsys):
     """From the drive to the page: a stage whose mode is elsewhere than the model says."""
     from slpi_ros.io.bag_writer import write_bag

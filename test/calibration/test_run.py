@@ -246,7 +246,7 @@ def test_a_hidden_cause_is_named_and_undone(tmp_path):
     assert all(step.name in page for step in outcome.steps)
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_sensor_that_is_slower_than_the_record_and_lost_messages_are_told(tmp_path):
     class Held(SimulatedRecorder):
         def __call__(self, request):

@@ -124,7 +124,7 @@ def test_a_lag_that_is_a_delay_and_modes_that_are_none_leave_the_loop_stable():
     assert found.bandwidth > 15.0
 
 
-@pytest.mark.parametrize("twice", [1.0, 2.0])
+@pytest.mark.parametrize("twice", [1.0, pytest.param(2.0, marks=pytest.mark.long)])
 def test_a_measured_response_with_more_slope_than_that_of_the_model_counts_with_it(twice):
     model, omega = STAGES["a light mode"], 2.0 * pi * np.linspace(2.0, 300.0, 100)
     slope = design(model, RATE).plant.slope

@@ -4,9 +4,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from effects.cases import BY_NAME
 from hypothesis import example, given
 from hypothesis import strategies as st
-from effects.cases import BY_NAME
 from strategies import FAMILY_CASE, axis_model, axis_models, cases_and_paths, stream_forward
 
 from slpi_ros.compensator.axis import Axis

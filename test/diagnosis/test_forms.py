@@ -83,9 +83,8 @@ def test_a_well_damped_mode_is_found_from_two_speeds(damping):
 TAKEN_BACK = "a delay is named that takes back the second pole, which the largest damping of a mode leaves"
 
 
-@pytest.mark.parametrize(
-    "lag", [0.06, pytest.param(0.04, marks=[pytest.mark.long, pytest.mark.xfail(reason=TAKEN_BACK)])]
-)
+@pytest.mark.parametrize("lag", [0.06, pytest.param(0.04, marks=pytest.mark.xfail(reason=TAKEN_BACK))])
+@pytest.mark.long
 def test_a_lag_behind_the_hysteresis_is_an_overdamped_mode_and_carries_over(lag):
     """As of a sensor that is late."""
     noise = 8e-9

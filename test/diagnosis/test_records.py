@@ -133,6 +133,7 @@ def test_a_coarse_sensor_is_no_cause(digits):
     assert not axis.effects and not axis.given.changed and not extended.effects
 
 
+@pytest.mark.long
 def test_a_lag_is_proved_on_records_at_other_speeds():
     physics = Physics(amplifier=Amplifier(lag=4e-3))
     pair = [record(hertz, physics, seed=seed) for hertz, seed in ((0.8, 11), (3.0, 12))]

@@ -55,7 +55,8 @@ def test_a_sensor_is_no_cause(kind):
 OF_LATE = pytest.mark.xfail(reason="a lag and light modes are named instead of a delay of nine samples")
 
 
-@pytest.mark.parametrize("seed", [pytest.param(0, marks=OF_LATE), pytest.param(4, marks=pytest.mark.long)])
+@pytest.mark.parametrize("seed", [pytest.param(0, marks=OF_LATE), 4])
+@pytest.mark.long
 def test_readings_that_all_come_late_are_no_change(seed):
     """Equal triangles do not tell a delay from other dynamics; their own model is not out of date."""
     t = np.arange(SAMPLES) / RATE

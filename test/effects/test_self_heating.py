@@ -175,6 +175,7 @@ def test_a_path_known_in_advance_is_compensated_with_its_own_power():
     np.testing.assert_allclose(again, y, rtol=0, atol=1e-4 * np.std(ignored - y))
 
 
+@pytest.mark.long
 def test_noise_of_a_measured_voltage_is_no_power():
     hidden = hide(1, [], base="preisach", axes=1, samples=12_000)
     v = hidden.record.voltage["x"] + np.random.default_rng(0).normal(0.0, 0.03, len(hidden.record))

@@ -46,7 +46,7 @@ def record(t, v, y):
 
 @pytest.mark.parametrize("jitter", [False, True])
 @pytest.mark.parametrize("digits", [0.0, 1e-9, 1e-8])
-@pytest.mark.parametrize(("rate", "seconds"), [(1000, 15.0), (10_000, 3.0)])
+@pytest.mark.parametrize(("rate", "seconds"), [(1000, 15.0), pytest.param(10_000, 3.0, marks=pytest.mark.long)])
 def test_held_readings_are_found_with_their_rate(rate, seconds, digits, jitter):
     rng = np.random.default_rng(3)
     t, v = drive(rng, rate, seconds)

@@ -82,7 +82,7 @@ def test_a_part_beyond_the_record_is_told_its_length():
         select_samples(calibration(seed=1)[0], "x", 30.0, None)
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", [0, *(pytest.param(k, marks=pytest.mark.long) for k in range(1, 4))])
 def test_what_has_nothing_to_do_with_the_voltage_has_no_wrong_sign(seed):
     record, _ = calibration(seed=1)
     noise = 1e-6 * np.random.default_rng(seed).standard_normal(len(record))

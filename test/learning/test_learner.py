@@ -348,6 +348,7 @@ def test_another_model_begins_anew_from_the_correction_of_the_path(model):
     assert np.array_equal(learner.path(), desired)
 
 
+@pytest.mark.long
 def test_two_axes_by_name_and_a_path_that_does_not_close(model):
     axis = model.axes["x"]
     both = slpi_ros.StageModel({"x": axis, "y": axis})

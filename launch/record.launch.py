@@ -16,6 +16,7 @@ from launch import LaunchDescription
 TOPICS = {
     "voltage_topic": ("voltage_command", "topic of the voltage commands"),
     "voltage_trajectory_topic": ("voltage_trajectory", "topic of a whole drive, with output: trajectory"),
+    "trajectory_state_topic": ("voltage_trajectory_state", "topic of what becomes of it"),
     "state_topic": ("stage_state", "topic of the stage state"),
 }
 

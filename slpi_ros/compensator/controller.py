@@ -488,11 +488,6 @@ class Controller:
             self._end_block(now_ns)
         return block.done
 
-    @property
-    def block_beyond_limits(self) -> bool:
-        """Whether a device plays a block that leaves limits which have come since."""
-        return self.mode is OperatingMode.BLOCK and self.block is not None and self.block.beyond_limits
-
     def _end_block(self, now_ns: int) -> None:
         for axis in self.axes:
             axis.begin(Idle(), now_ns)

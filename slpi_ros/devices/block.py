@@ -1,7 +1,7 @@
 """A block of voltages for a device: checked as a whole, then played by the device's clock or streamed; without ROS."""
 
 from collections import deque
-from collections.abc import Generator, Sequence
+from collections.abc import Generator, Mapping, Sequence
 from dataclasses import dataclass
 from enum import Enum
 
@@ -14,7 +14,7 @@ from slpi_ros.model.limits import volts
 
 # Steps of a block may exceed the slew limit by rounding, and its samples miss the device's clock by this share.
 ROUNDING, OFF_CLOCK = 1e-6, 1e-3
-# The device is asked for its sample once in this time.
+# The device is asked for its sample once in this time, and how far a block is is said that often.
 ASK_NS = SECOND_NS // 20
 BUSY = "a block is being played; wait for its end, or stop it with an empty trajectory"
 
@@ -39,6 +39,16 @@ class BlockState:
     reason: str = ""
 
 
+def block_state(message: str, values: Mapping[str, str]) -> BlockState | None:
+    """Return what a driver says on `voltage_trajectory_state`, None if it is no state of a block."""
+    seconds, _, rest = values.get("stamp", "").partition(".")
+    sample, known = values.get("sample", ""), message in {phase.value for phase in BlockPhase}
+    if not (known and seconds.isdecimal() and rest.isdecimal() and sample.isdecimal()):
+        return None
+    stamp_ns = int(seconds) * SECOND_NS + int(rest)
+    return BlockState(BlockPhase(message), stamp_ns, int(sample), values.get("reason", ""))
+
+
 def refusal(request: TrajectoryArrays, settings: LoopSettings, present: Sequence[float]) -> str:
     """Return why a block of voltages (V) may not be played from the `present` ones (V), "" if it may."""
     axes, times, values = settings.axes, request.time_from_start_ns, request.values
@@ -52,8 +62,9 @@ def refusal(request: TrajectoryArrays, settings: LoopSettings, present: Sequence
         return "its times do not increase; give each sample its own time"
     if not np.isfinite(values).all():
         return "a voltage is not finite"
-    # The first sample may be as far as one cycle of single voltages.
-    seconds = np.diff(times, prepend=min(0, times[0] - round(2.0 * SECOND_NS / settings.rate))) / SECOND_NS
+    # The first sample may be as far as one step of single voltages, whatever its time: a device that plays the block
+    # knows no times, and begins with it at once.
+    seconds = np.concatenate([[2.0 / settings.rate], np.diff(times) / SECOND_NS])
     for name, v in zip(request.names, values.T, strict=True):
         place = axes.index(name)
         own = settings.limits[place]
@@ -95,6 +106,7 @@ class BlockPlayer:
         self.recording: Recording | None = None
         self.readings: list[Reading] = []  # while it is streamed: its record
         self._life: Generator[None] | None = None  # what the device still has to do
+        self._how = ""  # why it is streamed
         self._asked_ns = self._now_ns = 0
 
     @property
@@ -106,7 +118,21 @@ class BlockPlayer:
         """Say how far it is."""
         self._states.append(BlockState(phase, self.stamp_ns, self.sample, reason))
 
-    def prepare(self, device: Device) -> str:
+    def accept(self, device: Device, now_ns: int) -> None:
+        """Choose how it is played, and say so."""
+        self._how = self._prepare(device)
+        self._tell_accepted(now_ns)
+
+    def wait(self, now_ns: int) -> None:
+        """Say again that it is accepted, while it is loaded or waits for that: whoever hears nothing gives it up."""
+        if not self.begun_ns and not self.ended and now_ns - self._asked_ns >= ASK_NS:
+            self._tell_accepted(now_ns)
+
+    def _tell_accepted(self, now_ns: int) -> None:
+        self._asked_ns = now_ns
+        self.tell(BlockPhase.ACCEPTED, self._how)
+
+    def _prepare(self, device: Device) -> str:
         """Choose how the block is played; return why it is streamed, "" if the device plays it."""
         if not device.block_period:
             return "the device plays no blocks: streamed"
@@ -129,6 +155,7 @@ class BlockPlayer:
         self._now_ns = now_ns
         if self._life is not None:
             next(self._life, None)
+            self.wait(now_ns)
 
     def _play(self, device: Device, period: float) -> Generator[None]:
         """Load, play and read it, in pieces of one wait of the device each."""
@@ -176,7 +203,8 @@ class BlockPlayer:
 class Blocks:
     """The blocks of a device, one at a time: taken or refused, played or streamed, stopped, and what was recorded.
 
-    `submit` and `busy` are for any thread, the others for that of the device. Where a block ends, `writer` goes on.
+    `submit` and `busy` are for any thread, the others for that of the device. Where a block ends, `writer` goes on. The
+    next one may follow from then on: it waits until the device has told what it recorded of the one before.
     """
 
     def __init__(self, device: Device, settings: LoopSettings, writer: Writer) -> None:
@@ -185,15 +213,21 @@ class Blocks:
         self._device, self._settings, self._writer = device, settings, writer
         self._submitted: deque[TrajectoryArrays] = deque()
         self._block: BlockPlayer | None = None
+        self._next: BlockPlayer | None = None  # waits
 
     def submit(self, request: TrajectoryArrays) -> None:
         """Take a block of voltages (V) to play, or an empty one to stop; what becomes of it appears in `states`."""
         self._submitted.append(request)
 
     @property
+    def _going(self) -> BlockPlayer | None:
+        """The block that has not ended yet."""
+        return next((each for each in (self._block, self._next) if each is not None and not each.ended), None)
+
+    @property
     def moving(self) -> bool:
         """Whether a block is being played or streamed, or loaded for that."""
-        return self._block is not None and not self._block.ended
+        return self._going is not None
 
     @property
     def busy(self) -> bool:
@@ -213,17 +247,21 @@ class Blocks:
             if not request.time_from_start_ns.size:
                 self.stop("by an empty trajectory")
                 continue
-            reason = held or (BUSY if self._block else refusal(request, self._settings, self._writer.written))
+            reason = held or (BUSY if self.moving else refusal(request, self._settings, self._writer.written))
             if reason:
                 self.states.append(BlockState(BlockPhase.REFUSED, request.start_ns, 0, reason))
                 continue
-            self._block = block = BlockPlayer(request, self._settings.axes, self._writer.written, self.states)
+            self._next = BlockPlayer(request, self._settings.axes, self._writer.written, self.states)
             self._writer.goal = None
-            block.tell(BlockPhase.ACCEPTED, block.prepare(self._device))
+            self._next.accept(self._device, now_ns)
+        if self._block is None:
+            self._block, self._next = self._next, None
+        if self._next is not None:
+            self._next.wait(now_ns)
         if self._block is not None:
-            moving = self.moving
+            moving = not self._block.ended
             self._block.turn(now_ns)
-            if moving and not self.moving:
+            if moving and self._block.ended:
                 self._writer.start(self._block.last)
 
     def goal(self, now_ns: int) -> tuple[float, ...] | None:
@@ -243,21 +281,24 @@ class Blocks:
 
     def stop(self, reason: str) -> str:
         """Stop the block that is being played where it is; return which sample that is, "" if there is none."""
-        block = self._block
-        if block is None or block.ended:
+        block = self._going
+        if block is None:
             return ""
         if self.by_device:
             block.sample = self._device.halt()
             self._writer.start(self._device.read().voltages)
         block.finish(BlockPhase.STOPPED, reason)
-        self._put_away(block)
+        if block is self._next:
+            self._next = None
+        else:
+            self._put_away(block)
         return f"the block was stopped at sample {block.sample} of {block.count}"
 
     def drop(self, reason: str) -> None:
         """End the block, as the link is lost."""
-        if self._block is not None and not self._block.ended:
-            self._block.finish(BlockPhase.STOPPED, reason)
-        self._block = None
+        if (block := self._going) is not None:
+            block.finish(BlockPhase.STOPPED, reason)
+        self._block = self._next = None
 
     def _put_away(self, block: BlockPlayer) -> None:
         if block.done:

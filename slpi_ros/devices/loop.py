@@ -171,7 +171,10 @@ class DeviceLoop:
         self._on_reading(reading)
         self.blocks.note(reading)
         if self._moving and not self.blocks.by_device and (found := self._writer.compare(reading, now_ns)):
-            self._hold(f"{self._device.name}: {found}")
+            reason = f"{self._device.name}: {found}"
+            # It begins, or goes on, at another voltage than the one that is there.
+            self.blocks.stop(reason)
+            self._hold(reason)
         for new in self.monitor.look(reading, now_ns):
             if new.rule == "commands":
                 self._fall_silent(new)

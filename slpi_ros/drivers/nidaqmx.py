@@ -277,6 +277,8 @@ class NidaqmxDevice(Device):
         return f"slpi_ros_{self._device}_{what}"
 
     def _task(self, what: str) -> Any:
+        # That of a block which was stopped before it began.
+        self._clear(what)
         name = self._name_of(what) if self._link else ""
         self._tasks[what] = nidaqmx.Task(name, grpc_options=self._options(name))
         return self._tasks[what]

@@ -196,13 +196,12 @@ class Playback:
             self._next = 0
         return sample
 
-    def stop(self) -> bool:
-        """Start the return to the rest voltages; return False if it has already been started."""
-        if self.stopping:
-            return False
+    def stop(self, present: Sequence[float]) -> None:
+        """Let the rest be the way from `present` voltages (V), where the axes are, to the rest voltages."""
         self.stopping = True
-        self._samples, self._next = self._return_path(self._samples[max(self._next - 1, 0)]), 0
-        return True
+        within = zip(self.drive.specs.values(), present, strict=True)
+        there = np.array([min(max(v, spec.low), spec.high) for spec, v in within])
+        self._samples, self._next = np.vstack([there, self._return_path(there)]), 0
 
     def _return_path(self, present: FloatArray) -> FloatArray:
         """Return the voltages (V) from `present` to the rest voltages, shape (n, axes), all axes moving at once."""

@@ -134,15 +134,16 @@ class Compensator(LifecycleNode):
             axis.check_loop(loop, new.period)
 
     def _use_settings(self, new: CompensatorSettings) -> None:
-        self._controller.use_limits(new.limits, time.monotonic_ns(), new.period)
-        if self._controller.block_beyond_limits:
+        controller = self._controller
+        controller.use_limits(new.limits, time.monotonic_ns(), new.period)
+        if controller.mode is OperatingMode.BLOCK and controller.block and controller.block.beyond_limits:
             # What the device has not played yet was checked with other limits; from where it stops the voltage goes
             # inside.
             self.get_logger().warning("the block that the device plays is beyond the new limits: it is stopped")
             self._output.stop_block()
-        for axis, loop in zip(self._controller.axes, new.loops, strict=True):
+        for axis, loop in zip(controller.axes, new.loops, strict=True):
             axis.retune(loop)
-        self._controller.messages.use(new.time)
+        controller.messages.use(new.time)
         self._use_learning(new)
 
     def _use_learning(self, settings: CompensatorSettings) -> None:

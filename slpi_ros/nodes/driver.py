@@ -9,6 +9,7 @@ from functools import partial
 
 import numpy as np
 from diagnostic_msgs.msg import DiagnosticStatus
+from rclpy.duration import Duration
 from rclpy.node import Node
 from sensor_msgs.msg import JointState
 from std_msgs.msg import Float64MultiArray
@@ -44,6 +45,8 @@ from slpi_ros.nodes.parameters import Declaration, Parameters, Values, limits_of
 HOLD, REST = "hold", "rest"
 # Period of diagnostics, and of looks at what the thread of the device has done, seconds.
 REPORT_PERIOD, LOOK_PERIOD, LOG_PERIOD = 0.5, 0.05, 5.0
+# Time for the delivery of what became of a block.
+DELIVERY = Duration(seconds=1.0)
 # Share of the cycles that may be left out without a warning.
 LATE_SHARE = 0.02
 # What to do about displacements that are none.
@@ -179,6 +182,7 @@ class Driver(Node):
         self._commands = self.create_subscription(Float64MultiArray, "voltage_command", self._on_command, COMMANDS)
         self.create_subscription(JointTrajectory, "voltage_trajectory", self._on_trajectory, COMMANDS, raw=True)
         self._block_publisher = self.create_publisher(DiagnosticStatus, "voltage_trajectory_state", LATCHED)
+        self._told: BlockState | None = None
         self._recording_publisher = self.create_publisher(JointTrajectory, "recorded_trajectory", COMMANDS)
         self._other, self._listening = OtherDriver(self, "stage_state", values["axes"]), True
         steady_timer(self, LOOK_PERIOD, self._look)
@@ -191,6 +195,10 @@ class Driver(Node):
         while self._thread.is_alive():
             # A join without timeout would not be interrupted by a signal.
             self._thread.join(LOOK_PERIOD)
+        if self._loop.blocks.states and self.context.ok():
+            # That a block was stopped where it was: whoever sent it would wait for that.
+            self._tell_blocks()
+            self._block_publisher.wait_for_all_acked(DELIVERY)
         super().destroy_node()
 
     # The thread of the device
@@ -229,13 +237,21 @@ class Driver(Node):
     def _on_trajectory(self, data: bytes) -> None:
         self._loop.blocks.submit(read_trajectory(data, "effort"))
 
+    def _tell_blocks(self) -> None:
+        """Tell what has become of blocks."""
+        while self._loop.blocks.states:
+            self._tell_block(self._loop.blocks.states.popleft())
+
     def _tell_block(self, state: BlockState) -> None:
         seconds, rest = divmod(state.stamp_ns, SECOND_NS)
         values = {"stamp": f"{seconds}.{rest:09d}", "sample": str(state.sample), "reason": state.reason}
         problem = ((WARN, state.phase.value),) if state.phase in (BlockPhase.REFUSED, BlockPhase.STOPPED) else ()
         health = Health(problem, state.phase.value, values, self._frame)
         self._block_publisher.publish(health.status(f"{self.get_fully_qualified_name()}: block"))
-        if state.phase is not BlockPhase.PLAYING:
+        # That it is being loaded or played is told again and again.
+        again = state.phase is BlockPhase.PLAYING or (state.phase is BlockPhase.ACCEPTED and state == self._told)
+        self._told = state
+        if not again:
             reason = f": {state.reason}" if state.reason else ""
             self.get_logger().info(f"block {state.phase.value} at sample {state.sample}{reason}")
 
@@ -264,8 +280,7 @@ class Driver(Node):
         while self._loop.answers:
             what, success, text = self._loop.answers.popleft()
             self._deferred[what].answer(success, text)
-        while self._loop.blocks.states:
-            self._tell_block(self._loop.blocks.states.popleft())
+        self._tell_blocks()
         while self._loop.blocks.recorded:
             self._publish_recording(self._loop.blocks.recorded.popleft())
         status, now = self._loop.status, time.monotonic()

@@ -4,23 +4,30 @@ import math
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
+from diagnostic_msgs.msg import DiagnosticStatus
 from rclpy.node import Node
 from trajectory_msgs.msg import JointTrajectory
 
+from slpi_ros.arrays import FloatArray
+from slpi_ros.calibration.block_drive import REPORT_LASTS, REPORT_PATIENCE, BlockDrive
 from slpi_ros.compensator.amplifier import TOLERATED_SHARE
+from slpi_ros.devices.block import block_state
 from slpi_ros.errors import RecordError, SlpiError, UsageError
 from slpi_ros.excitation.drives import DRIVES, SLEW_USED, Drive, Playback, excite
 from slpi_ros.io.messages import SECOND_NS, encode_trajectory
 from slpi_ros.model.limits import Limits, volts
 from slpi_ros.model.mean_rate import WINDOW, highest_mean_rate, slower_by
 from slpi_ros.nodes import parameters as declare
-from slpi_ros.nodes.common import COMMANDS, request_stop, serve, steady_timer
+from slpi_ros.nodes.common import COMMANDS, LATCHED, make_executor, request_stop, serve, steady_timer
 from slpi_ros.nodes.guarded_drive import GuardedDrive
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, limits_of, validated
 
 LIVE = "live"
+# Where a driver tells what becomes of a block.
+BLOCK_STATE = "voltage_trajectory_state"
 
 DECLARATIONS = (
     declare.AXES,
@@ -93,9 +100,6 @@ class ExciterSettings:
 
 # Period of the watch and of messages while it waits, seconds.
 WATCH_PERIOD, LOG_PERIOD = 0.02, 5.0
-# Time to wait at the end for stage_state to report the last voltage, and what such a report must then last
-# for a slow stage to have come all the way, seconds.
-REPORT_PATIENCE, REPORT_LASTS = 3.0, 0.5
 # A warning is logged if the excitation takes longer than planned by this factor.
 SLUGGISH = 1.02
 
@@ -105,14 +109,16 @@ class Exciter(Node):
 
     Publishes ``voltage_command`` with one sample per period of a monotonic clock: after a stall of the process the
     excitation continues with the next sample, without a voltage step. With the parameter ``output`` "trajectory" all
-    samples are published in one message on ``voltage_trajectory``, volts in ``effort``, no positions. The node waits
+    samples are published in one message on ``voltage_trajectory``, volts in ``effort``, no positions, and
+    ``voltage_trajectory_state`` tells what becomes of it (`slpi_ros.calibration.block_drive`). The node waits
     for a subscriber, and for ``stage_state`` to report where the amplifier is (or the parameter ``rest_voltage``), and
     says so while it waits. At the end it waits for ``stage_state`` to report the last voltage: a record that ends
     earlier would not hold the memory at its end.
 
     It drives only while no other node publishes the topic of its voltages, and while ``stage_state`` reports what the
     voltages can have caused (`slpi_ros.calibration.drive_monitor`). Else it returns to rest at the slew limit and ends
-    with exit code 1 (without ``autostart`` it stays). A trajectory is not watched: the device plays it by itself.
+    with exit code 1 (without ``autostart`` it stays), as it does where a trajectory was not played, or it is not known
+    to have stopped and returned. The reports are not held against a trajectory: the device plays it by itself.
     Services ``~/start`` and ``~/stop`` (std_srvs/Trigger); parameters in `DECLARATIONS`.
     """
 
@@ -122,16 +128,20 @@ class Exciter(Node):
         self._parameter_set.follow(lambda settings: None)
         values = self._values
         self._playback: Playback | None = None
+        self._block: BlockDrive | None = None  # of the playback, unless it is live
         self._timer = None
         self._live = values["output"] == LIVE
         publisher = None if self._live else self.create_publisher(JointTrajectory, "voltage_trajectory", COMMANDS)
-        self._guard = GuardedDrive(self, values, publisher=publisher)
+        self._guard = GuardedDrive(self, values, self._on_state, publisher)
+        if not self._live:
+            self.create_subscription(DiagnosticStatus, BLOCK_STATE, self._on_block_state, LATCHED)
+        self._stamp_ns = 0  # of the last block
         serve(self, "~/start", self._on_start)
         serve(self, "~/stop", self._on_stop)
         self._listeners, self._same_since = 0, 0.0  # number of subscribers, and since when it is the same
         self._refusal: SlpiError | None = None
         self._rest: list[float] = []
-        self._waiting = self._returning = self._arriving = self._leaving = False
+        self._waiting = self._returning = self._arriving = self._leaving = self._ending = False
         self._begun = 0.0  # of waiting, of the excitation, of its end
         steady_timer(self, WATCH_PERIOD, self._watch)
         if values["autostart"]:
@@ -140,12 +150,23 @@ class Exciter(Node):
     def destroy_node(self) -> None:
         """Return the axes to rest, then destroy the node."""
         if self.context.ok():
-            if self._playback and self._live:
-                self._guard.return_to(self._rest)
+            if self._block is not None:
+                self._end_block(self._block)
             elif self._playback:
-                time.sleep(self._return(self._playback))
+                self._guard.return_to(self._rest)
             self._guard.deliver()
         super().destroy_node()
+
+    def _end_block(self, block: BlockDrive) -> None:
+        """Stop the block and wait for the way back to rest, which the driver and the stage tell."""
+        self._ending = True
+        block.stop()
+        executor = make_executor("default")
+        executor.add_node(self)
+        while self._block is not None:
+            executor.spin_once(timeout_sec=WATCH_PERIOD)
+        executor.remove_node(self)
+        executor.shutdown()
 
     @property
     def _values(self) -> Values:
@@ -213,11 +234,12 @@ class Exciter(Node):
             )
         self._refusal, self._returning, self._arriving = None, False, self._live
         self._playback, self._begun = Playback(drive, repeat=self._values["repeat"]), time.monotonic()
-        if self._live and heard:
-            self._guard.begin()
-        self._timer = steady_timer(self, 1.0 / drive.rate, self._step)
-        if not self._live:
-            self._guard.publisher.publish(trajectory_of(self._playback))
+        if self._live:
+            if heard:
+                self._guard.begin()
+            self._timer = steady_timer(self, 1.0 / drive.rate, self._step)
+        else:
+            self._begin_block(self._playback)
         self.get_logger().info(f"exciting {', '.join(drive.axes)} for {self._values['duration']:g} s. {drive.why}")
 
     def _watch(self) -> None:
@@ -228,14 +250,23 @@ class Exciter(Node):
             self._leave_when_reported()
         elif self._waiting:
             self._start_when_ready()
-        elif fault is not None and self._playback and not (self._returning or self._playback.stopping):
+        elif fault is not None and self._playback and not self._stopped:
             self._refusal = fault
             self.get_logger().error(f"{fault}; returning to rest")
-            self._return(self._playback)
+            self._return()
+        if self._block is not None and self._playback is not None:
+            self._block.look(time.monotonic_ns())
+            if self._block.over:
+                self._end(self._playback)
+
+    @property
+    def _stopped(self) -> bool:
+        """Whether the return to rest has begun."""
+        return self._returning or (self._block is not None and self._block.stopped)
 
     def _give_up(self, error: SlpiError) -> None:
-        """Report the error; end with its exit code if the node has started by itself."""
-        if self._values["autostart"]:
+        """Report the error; end with its exit code if the node has started by itself, or ends anyway."""
+        if self._values["autostart"] or self._ending:
             request_stop(error)
         else:
             self.get_logger().error(str(error))
@@ -253,24 +284,28 @@ class Exciter(Node):
             self._begun, ended = time.monotonic(), False
         else:
             sample = playback.next()
-            if self._live:
-                self._guard.move(sample)
-            ended = playback.done and (not self._live or self._guard.at(sample))
+            self._guard.move(sample)
+            ended = playback.done and self._guard.at(sample)
         if ended:
             self._end(playback)
 
     def _end(self, playback: Playback) -> None:
-        self.destroy_timer(self._timer)
+        if self._timer is not None:
+            self.destroy_timer(self._timer)
         self._guard.end()
-        self._playback = None
-        stopped = self._returning or playback.stopping
+        stopped, block = self._stopped, self._block
+        self._playback = self._block = None
         took, planned = time.monotonic() - self._begun, playback.drive.t[-1]
-        rest = ", ".join(f"{axis} at {v:g} V" for axis, v in zip(playback.drive.axes, self._rest, strict=True))
-        self.get_logger().info(f"{'stopped' if stopped else 'done'} after {took:.1f} s; {rest}")
+        if block is not None and block.failure:
+            self._refusal = self._failed(block)
+        else:
+            rest = ", ".join(f"{axis} at {v:g} V" for axis, v in zip(playback.drive.axes, self._rest, strict=True))
+            sure = "" if block is None or block.told else ", which no driver has confirmed"
+            self.get_logger().info(f"{'stopped' if stopped else 'done'} after {took:.1f} s{sure}; {rest}")
         if self._refusal is not None:
             self._give_up(self._refusal)
         elif not stopped:
-            if took > SLUGGISH * planned:
+            if self._live and took > SLUGGISH * planned:
                 self.get_logger().warning(
                     f"the excitation took {took:.1f} s instead of {planned:.1f} s; use a lower rate on this machine"
                 )
@@ -288,24 +323,58 @@ class Exciter(Node):
                 )
             request_stop()
 
+    # A drive as one block
+
+    def _begin_block(self, playback: Playback) -> None:
+        """Send the drive to the driver."""
+        topic = self.resolve_topic_name(BLOCK_STATE)
+        if not (expected := self.count_publishers(topic) > 0):
+            self.get_logger().warning(f"nobody publishes {topic}: whether the trajectory is played is not confirmed")
+        limits, send = self._parameter_set.settings.limits, partial(self._send, playback.drive)
+        self._block = BlockDrive(playback, limits, send, time.monotonic_ns(), expected=expected)
+
+    def _send(self, drive: Drive, voltages: FloatArray) -> int:
+        """Publish voltages (V), shape (N, axes), of a drive as a block, none to stop it; return its stamp (ns)."""
+        # A simulated clock may stand still.
+        self._stamp_ns = max(self.get_clock().now().nanoseconds, self._stamp_ns + 1)
+        self._guard.publisher.publish(trajectory_of(self._stamp_ns, drive.axes, voltages, drive.rate))
+        return self._stamp_ns
+
+    def _on_block_state(self, status: DiagnosticStatus) -> None:
+        state = block_state(status.message, {each.key: each.value for each in status.values})
+        if state is not None and self._block is not None:
+            self._block.hear(state)
+
+    def _on_state(self, _data: bytes, _clock_ns: int, displacements: Sequence[float]) -> None:
+        if displacements and self._block is not None and self._guard.reported is not None:
+            self._block.report(self._guard.reported)
+
+    def _failed(self, block: BlockDrive) -> RecordError:
+        """Return why a block was not played, stopped or brought back, and where the stage is."""
+        reported = self._guard.reported
+        there = f"stage_state reports {volts(*reported)} V" if reported else "nothing reports where the stage is"
+        before = f"{self._refusal}; besides, " if self._refusal is not None else f"{self.get_name()}: "
+        return RecordError(f"{before}{block.failure}; {there}, rest_voltage is {volts(*self._rest)} V")
+
     # Stop
 
     def _on_stop(self) -> tuple[bool, str]:
         self._waiting = False
-        return True, f"back in {self._return(self._playback):.1f} s" if self._playback else "at rest"
+        return True, self._return() if self._playback else "at rest"
 
-    def _return(self, playback: Playback) -> float:
-        """Start the return to rest; return its duration, seconds."""
-        if self._live:
-            self._returning = True
-            return self._guard.return_seconds(self._rest)
-        if playback.stop():
-            self._guard.publisher.publish(trajectory_of(playback))
-        return playback.seconds_left
+    def _return(self) -> str:
+        """Start the return to rest; return what happens now."""
+        if self._block is not None:
+            self._block.stop()
+            return "the driver is asked to stop the trajectory; the way back begins where it holds"
+        self._returning = True
+        return f"back in {self._guard.return_seconds(self._rest):.1f} s"
 
 
-def trajectory_of(playback: Playback) -> bytes:
-    """Return the remaining samples as a serialised trajectory that starts now: volts in ``effort``, no positions."""
-    voltages, drive = playback.samples_left, playback.drive
-    times_ns = np.round(np.arange(1, len(voltages) + 1) * (SECOND_NS / drive.rate)).astype(np.int64)
-    return encode_trajectory(0, drive.axes, times_ns, np.empty((len(voltages), 0)), voltages)
+def trajectory_of(stamp_ns: int, axes: Sequence[str], voltages: FloatArray, rate: float) -> bytes:
+    """Return voltages (V), shape (N, axes), at a rate (Hz) as a serialised trajectory made at a time (ns).
+
+    Volts are in ``effort``, there are no positions, and the first sample is one period after the start.
+    """
+    times_ns = np.round(np.arange(1, len(voltages) + 1) * (SECOND_NS / rate)).astype(np.int64)
+    return encode_trajectory(stamp_ns, axes, times_ns, np.empty((len(voltages), 0)), voltages)

@@ -196,6 +196,15 @@ def test_a_way_back_that_is_refused_or_not_reached_is_said():
     assert "return is not confirmed: stage_state reports 50 V" in amplifier.until_over().failure
 
 
+def test_a_stage_that_falls_silent_is_not_moved():
+    amplifier = Amplifier()
+    amplifier.until(lambda: amplifier.now >= 1.5)
+    amplifier.reports = False
+    amplifier.drive.stop()
+    assert "stage_state no longer comes" in amplifier.until_over().failure
+    assert len(amplifier.blocks) == 1
+
+
 def test_a_stop_beside_the_end_is_no_failure():
     amplifier = Amplifier()
     amplifier.until(lambda: amplifier.now >= DURATION)

@@ -176,11 +176,11 @@ def test_limits_that_come_while_a_block_is_played_hold_for_the_rest_of_it(limits
     block, _ = block_of(made)
     made.hear_block(STAMP, PLAYING, 5, "", 3 * 10**9)
     made.use_limits([limits], 3 * 10**9, PERIOD)
-    assert made.block_beyond_limits is beyond
+    assert made.block.beyond_limits is beyond
     # What has been played counts no more.
     made.use_limits([replace(limits, upper=100.0)], 3 * 10**9, PERIOD)
     made.hear_block(STAMP, PLAYING, len(block.voltages), "", 3 * 10**9)
-    assert not made.block_beyond_limits
+    assert not made.block.beyond_limits
 
 
 def test_after_a_block_the_voltage_goes_inside_limits_that_have_come_meanwhile():

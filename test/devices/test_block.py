@@ -8,8 +8,10 @@ from collections import deque
 import numpy as np
 import pytest
 from drivers.kinds import KINDS
+from hypothesis import given
+from hypothesis import strategies as st
 
-from slpi_ros.devices.block import BlockPhase
+from slpi_ros.devices.block import BlockPhase, BlockState, block_state, refusal
 from slpi_ros.devices.link import State
 from slpi_ros.devices.loop import DeviceLoop
 from slpi_ros.devices.writer import LoopSettings
@@ -58,11 +60,13 @@ class Bench:
 
     @property
     def told(self):
-        return [state.phase for state in self.states]
+        """What was told, one after the other; how far a block is is told again and again."""
+        phases = [state.phase for state in self.states]
+        return [phase for phase, before in zip(phases, [None, *phases], strict=False) if phase is not before]
 
-    def submit(self, voltages, period, names=None, stamp=7):
+    def submit(self, voltages, period, names=None, stamp=7, first=0.0):
         voltages = np.asarray(voltages, float)
-        times = np.round(np.arange(len(voltages)) * period * 1e9).astype(np.int64)
+        times = np.round((first + np.arange(len(voltages)) * period) * 1e9).astype(np.int64)
         self.loop.blocks.submit(TrajectoryArrays(stamp, names or self.axes[: voltages.shape[1]], times, voltages))
 
     def path(self, place=0):
@@ -160,6 +164,49 @@ def test_what_is_refused_moves_nothing(bench, voltages, names, named):
     assert bench.simulator.log == [] and not [each for each in bench.simulator.received if each.startswith("W")][1:]
 
 
+ONE = LoopSettings(("x",), (Limits(0.0, 100.0, 1000.0),), RATE)
+
+
+@given(
+    st.lists(st.floats(0.0, 100.0), min_size=1, max_size=5), st.sampled_from([50_000, 2_000_000, 33_333_333]),
+    st.integers(0, 10**12),
+)  # fmt: skip
+def test_the_time_of_the_first_sample_lets_it_go_no_further(voltages, period_ns, first_ns):
+    """A device that plays a block by its clock begins with it at once."""
+    times, v = np.arange(len(voltages)) * period_ns, np.array(voltages)[:, None]
+    refused = {refusal(TrajectoryArrays(7, ("x",), first + times, v), ONE, [50.0]) for first in (0, first_ns)}
+    assert len(refused) == 1
+    assert ("begins at" in refused.pop()) == (abs(voltages[0] - 50.0) > 1000.0 * 2.0 / RATE * (1.0 + 1e-3) + 1e-6)
+
+
+# Played by the device's clock, streamed as the samples are not even, and by a device that plays none.
+@pytest.mark.parametrize(
+    ("bench", "uneven"),
+    [
+        (("gcs", 1, [20.0], True), False),
+        (("gcs", 1, [20.0], False), True),
+        (("nidaqmx", 1, [20.0], True), False),
+        (("labjack", 1, [20.0], False), False),
+    ],
+    indirect=["bench"],
+)
+def test_a_block_with_a_later_first_sample_keeps_the_limits_at_the_wire(bench, uneven):
+    far, near = np.full((200, 1), 90.0), np.full((200, 1), 20.0 + 0.9 * SLEW * 2.0 / RATE)
+    for v, first in ((far, 0.1), (near, 0.1)):
+        v[-1] += 1e-3 * uneven
+        times = np.round((first + np.arange(200) * 2e-3) * 1e9).astype(np.int64)
+        times[-1] += 10**6 * uneven
+        bench.loop.blocks.submit(TrajectoryArrays(7, ("a0",), times, v))
+        bench.turn(3)
+        if v is far:
+            assert bench.told == [BlockPhase.REFUSED] and "begins at 90 V" in bench.states[0].reason
+            assert bench.simulator.log == []
+    bench.until(lambda: bench.told[-1] is BlockPhase.ENDED)
+    assert ("streamed" in bench.states[1].reason) == (uneven or bench.kind.device == "labjack")
+    np.testing.assert_allclose(bench.path()[-1], near[-1], atol=1e-4)
+    assert bench.largest_step <= MOST_STEP + 2.0 * bench.kind.rounding
+
+
 @pytest.mark.parametrize("bench", [("gcs", 2, [20.0, 30.0], False)], indirect=True)
 def test_times_that_do_not_increase(bench):
     bench.loop.blocks.submit(TrajectoryArrays(7, ("a0",), np.array([0, 0]), np.array([[20.0], [20.0]])))
@@ -200,6 +247,88 @@ def test_stopped_it_holds_where_it_is(bench, how):
         bench.loop.command([20.0, 30.0])
         bench.until(lambda: bench.kind.volts(bench.simulator) == pytest.approx([20.0, 30.0], abs=1e-4))
     assert bench.largest_step <= MOST_STEP + 2.0 * bench.kind.rounding
+
+
+@pytest.mark.parametrize("bench", [("gcs", 1, [20.0], True), ("nidaqmx", 1, [20.0], True)], indirect=True)
+def test_the_next_block_may_follow_as_soon_as_the_last_one_is_stopped(bench):
+    """It waits until what was recorded has been read, says so, and can be stopped meanwhile."""
+    bench.submit(wave(40_000, 5e-4, 20.0), 5e-4)
+    # So long that its recording is read in several pieces.
+    bench.until(lambda: bench.states and bench.states[-1].sample > 1500)
+    bench.submit(np.zeros((0, 1)), 5e-4)
+    bench.turn()
+    assert bench.told[-1] is BlockPhase.STOPPED
+    there = bench.kind.volts(bench.simulator)[0]
+    assert there == pytest.approx(bench.loop.written[0], abs=2e-6)
+    for stamp in (8, 9):
+        bench.submit(np.linspace(there, there + 1.0, 100)[:, None], 5e-4, stamp=stamp)
+        if stamp == 8:
+            bench.submit(np.zeros((0, 1)), 5e-4)
+    assert "block" in bench.loop.command([20.0])
+    bench.until(lambda: bench.told[-1] is BlockPhase.ENDED)
+    assert [state.phase for state in bench.states if state.stamp_ns == 8] == [BlockPhase.ACCEPTED, BlockPhase.STOPPED]
+    later = [state.phase for state in bench.states if state.stamp_ns == 9]
+    assert later[0] is BlockPhase.ACCEPTED and later[-1] is BlockPhase.ENDED
+    assert len(bench.loop.blocks.recorded) >= 1
+    assert bench.kind.volts(bench.simulator)[0] == pytest.approx(there + 1.0, abs=1e-9)
+    assert bench.largest_step <= MOST_STEP + 2.0 * bench.kind.rounding
+
+
+@pytest.mark.parametrize("bench", [("gcs", 1, [20.0], True), ("nidaqmx", 1, [20.0], True)], indirect=True)
+def test_one_that_is_stopped_before_it_begins_leaves_the_device_at_work(bench):
+    bench.submit(wave(2000, 5e-4, 20.0), 5e-4)
+    bench.turn()
+    bench.submit(np.zeros((0, 1)), 5e-4)
+    bench.turn(2)
+    assert bench.told == [BlockPhase.ACCEPTED, BlockPhase.STOPPED] and bench.simulator.log == []
+    assert bench.loop.command([25.0]) == ""
+    bench.until(lambda: bench.kind.volts(bench.simulator) == pytest.approx([25.0], abs=1e-4))
+    bench.submit(wave(200, 5e-4, 25.0), 5e-4)
+    bench.until(lambda: bench.told[-1] is BlockPhase.ENDED)
+    assert bench.largest_step <= MOST_STEP + 2.0 * bench.kind.rounding
+
+
+@pytest.mark.parametrize(
+    "bench", [("gcs", 1, [20.0], False), ("gcs", 1, [20.0], False, {"without": ("WAV",)})], indirect=True
+)
+def test_a_device_that_somebody_else_moves_plays_no_block(bench):
+    """Neither one that is being loaded, nor one that is streamed; after ~/arm nothing of it is left."""
+    # Loaded for longer than the time after which the device is held; streamed, it writes nothing while it rests.
+    bench.submit(np.full((40_000, 1), 20.0), 2e-3)
+    bench.turn()
+    bench.simulator.set_by_hand("1", 40.0)
+    bench.until(lambda: bench.loop.status.state is State.HELD)
+    assert bench.told[-1] is BlockPhase.STOPPED and bench.states[-1].reason == bench.loop.status.reason
+    assert not bench.loop.blocks.moving
+    bench.loop.request("arm")
+    bench.turn(50)
+    assert bench.loop.status.state is State.ARMED and bench.kind.volts(bench.simulator) == [40.0]
+
+
+def test_a_long_load_is_told_again_and_again():
+    with KINDS["gcs"].simulate(voltages=[20.0]) as simulator:
+        bench = Bench(KINDS["gcs"], simulator, real=False)
+        bench.turn()
+        bench.submit(wave(40_000, 5e-4, 20.0), 5e-4)
+        bench.turn(round(0.3 * RATE))
+        assert bench.told == [BlockPhase.ACCEPTED] and 5 <= len(bench.states) <= 8
+        bench.loop._device.close()
+
+
+@pytest.mark.parametrize(
+    ("message", "values", "told"),
+    [
+        ("playing", {"stamp": "7.000000012", "sample": "3", "reason": ""},
+         BlockState(BlockPhase.PLAYING, 7_000_000_012, 3)),
+        ("refused", {"stamp": "0.5", "sample": "0", "reason": "why"}, BlockState(BlockPhase.REFUSED, 5, 0, "why")),
+        ("resting", {"stamp": "7.0", "sample": "3"}, None),
+        ("playing", {"stamp": "now", "sample": "3"}, None),
+        ("playing", {"stamp": "7.0", "sample": "-3"}, None),
+        ("playing", {}, None),
+    ],
+)  # fmt: skip
+def test_what_a_driver_tells_is_read(message, values, told):
+    assert block_state(message, values) == told
 
 
 @pytest.mark.long

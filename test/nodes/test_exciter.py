@@ -378,25 +378,58 @@ def test_it_waits_until_another_publisher_has_left():
         listener.wait_for_motion()
 
 
-def test_a_drive_as_one_trajectory():
+def seconds_of(time):
+    return time.sec + time.nanosec * 1e-9
+
+
+def test_a_drive_as_one_trajectory_that_nobody_tells_of():
+    """Where it has stopped is not known without a driver or a stage that says so: nothing is sent after that."""
     drive = {"duration": 60.0, "axes": ["x", "y"], "drive": "cross_coupling"}
     with on_graph() as graph, exciter(graph, **AT_ONCE, **drive, output="trajectory") as node:
         listener, trajectories = Listener(graph), graph.record(JointTrajectory, "voltage_trajectory")
         graph.spin_until(lambda: trajectories, "the trajectory")
-        # The axis is up between 1.5 and 3.9 s, however late the signal is.
-        until = time.monotonic() + 2.3
-        graph.spin_until(lambda: time.monotonic() > until, "the first full loop")
         node.process.send_signal(signal.SIGINT)
-        assert wait_for_end(graph, node) == 0
-    whole, back = trajectories
-    for trajectory in trajectories:
-        assert list(trajectory.joint_names) == ["x", "y"]
-        assert not any(len(point.positions) or len(point.velocities) for point in trajectory.points)
-        times = [point.time_from_start.sec + point.time_from_start.nanosec * 1e-9 for point in trajectory.points]
-        np.testing.assert_allclose(np.diff([0.0, *times]), 1.0 / RATE, atol=1e-9)
+        assert wait_for_end(graph, node) == 1
+        assert "not confirmed" in node.stderr
+        assert holds(node.stderr.splitlines()[-1], "stop is not confirmed", "nobody reports")
+    whole, stop = trajectories
+    assert list(whole.joint_names) == ["x", "y"] and not stop.points
+    assert not any(len(point.positions) or len(point.velocities) for point in whole.points)
+    times = [seconds_of(point.time_from_start) for point in whole.points]
+    np.testing.assert_allclose(np.diff([0.0, *times]), 1.0 / RATE, atol=1e-9)
     np.testing.assert_array_equal([list(point.effort) for point in whole.points], drawn(**drive))
-    assert back.points[0].effort[0] > 1.0 and back.points[-1].effort[0] == pytest.approx(0.0, abs=1e-9)
+    # They say when they were made.
+    assert 0.0 < time.time() - seconds_of(whole.header.stamp) < 60.0
+    assert seconds_of(whole.header.stamp) < seconds_of(stop.header.stamp)
     assert not listener.commands
+
+
+def test_a_stage_that_says_where_it_is_is_brought_back_without_a_driver_that_tells():
+    with on_graph() as graph, exciter(graph, **LIMITS, settle=0.0, duration=30.0, output="trajectory") as node:
+        playing, v = [], [20.0]
+
+        def take(trajectory):
+            playing[:] = [(time.monotonic(), np.array([point.effort[0] for point in trajectory.points]))]
+            trajectories.append(trajectory)
+
+        def report():
+            if playing and len(playing[0][1]):
+                begun, samples = playing[0]
+                v[0] = float(samples[min(int((time.monotonic() - begun) * RATE), len(samples) - 1)])
+            publisher.publish(JointState(name=["x"], position=[1e-7 * v[0]], effort=v))
+
+        trajectories = []
+        publisher = graph.node.create_publisher(JointState, "stage_state", RELIABLE)
+        graph.node.create_subscription(JointTrajectory, "voltage_trajectory", take, RELIABLE)
+        graph.node.create_timer(0.02, report)
+        graph.spin_until(lambda: v[0] > 60.0, "60 V")
+        node.process.send_signal(signal.SIGTERM)
+        assert wait_for_end(graph, node) == 0, node.stderr
+        assert holds(node.stderr.splitlines()[-1], "stopped after", "no driver has confirmed", "x at 20 V")
+    _, stop, back = trajectories
+    assert not stop.points and v[0] == pytest.approx(20.0, abs=1e-9)
+    samples = np.array([point.effort[0] for point in back.points])
+    assert samples[0] > 50.0 and np.abs(np.diff(samples)).max() <= 0.8 * 1000.0 / RATE
 
 
 def test_limits_must_be_given():

@@ -8,6 +8,7 @@ import argparse
 import re
 import secrets
 import shutil
+import signal
 import subprocess
 import sys
 import tempfile
@@ -50,6 +51,8 @@ KINDS = {"pi": "classical PI", "slpi": "SLPI"}
 
 def wipe(stage: Operator) -> tuple[float, float]:
     """Sweep the full range, so that the memory is wiped; return what can be reached from then on, (m, m)."""
+    if stage.state.effort:
+        stage.drive(np.linspace(stage.state.effort[0], V_MIN, int(RATE)).tolist(), RATE)
     sweep = V_MIN + (V_MAX - V_MIN) * (1 - np.cos(np.linspace(0.0, 2 * np.pi, int(2 * RATE)))) / 2
     falling = stage.drive([*sweep, *[V_MIN] * 20], RATE)[sweep.size // 2 :, 1]
     return float(falling.min()), float(falling.max())
@@ -120,8 +123,11 @@ def compared(seed: int, models: Mapping[str, Path], duration: float, warm_up: fl
         low, high = wipe(stage)
         bottom, top = low + MARGIN * (high - low), high - MARGIN * (high - low)
         t, y = scan_path(bottom, top, duration=duration, rate=RATE, seed=seed)
-        runs = [follow_uncompensated(stage, t, y, low, high)]
-        return runs + [follow_compensated(stage, name, model, t, y) for name, model in models.items()]
+        # First that of which the calibrator has told the error: from rest, as then. A stage that has moved creeps less.
+        order = reversed(models.items())
+        runs = {name: follow_compensated(stage, name, model, t, y) for name, model in order}
+        wipe(stage)
+        return [follow_uncompensated(stage, t, y, low, high), *(runs[name] for name in models)]
 
 
 def table_of(runs: Sequence[plots.Run], stroke: float) -> list[list[str]]:
@@ -183,6 +189,8 @@ def hidden_and_found(seed: int, model: slpi_ros.StageModel) -> str:
 
 def main() -> int:
     """Run the demo."""
+    # Its nodes end with it.
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit("demo: terminated"))
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("-o", "--output", type=Path, default=Path("demo_output"), help="folder for the pages")
     parser.add_argument("--seed", type=int, help="which stage; default: a random one")

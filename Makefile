@@ -42,7 +42,7 @@ endif
 # Modules need no rebuild: --symlink-install makes the source tree and the installed package one.
 INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch launch/* msg_schemas msg_schemas/* resource/*)
 
-.PHONY: help build test test-long test-properties test-jazzy test-newest test-kilted test-minimum test-environment demo bench bench-robustness bench-latency bench-platforms bench-soak bench-trajectory bench-xy bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-twins bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-oscillation bench-tune bench-export bench-coverage bench-identification bench-diagnosis-speed test-export-arm bench-company FORCE
+.PHONY: help build test test-long test-properties test-jazzy test-newest test-kilted test-minimum test-environment demo bench bench-robustness bench-latency bench-platforms bench-soak bench-trajectory bench-readme bench-faults bench-steps audit docs schemas package bench-lies bench-calibrator bench-promise bench-fleet clean distclean bench-restarts bench-rate-law bench-foreign bench-no-harm bench-measured bench-twins bench-agreement bench-confusion bench-driver bench-device-faults bench-device-lives bench-surroundings bench-learning bench-loop-rate bench-oscillation bench-tune bench-export bench-coverage bench-identification bench-diagnosis-speed test-export-arm bench-company FORCE
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
@@ -71,7 +71,6 @@ help:
 	@echo 'make bench-company    200 lives of nodes beside each other: voltages from what must not move, refusals; half an hour; COMPANY="--lives 60"'
 	@echo 'make bench-soak     10 minutes at 1 kHz, 1 minute at 5 kHz, and the ceiling'
 	@echo 'make bench-trajectory  a trajectory of a million points: acceptance and deadlines'
-	@echo 'make bench-xy       the five segments of the MPI paper through the nodes, with and without feedback'
 	@echo 'make bench-readme   the commands of README on five simulated stages, and on the next day, 10 minutes'
 	@echo 'make bench-steps    largest step, slew and acceleration that leave a compensator, 10,000 episodes and 100 lives; 40 minutes'
 	@echo 'make bench-faults   mutated files, node lives under faults, half an hour at 1 kHz, a day at accelerated time; 90 minutes'
@@ -200,9 +199,6 @@ bench-soak: build
 
 bench-trajectory: build
 	$(IN_OWN_DOMAIN) $(VENV) benchmarks/trajectory.py
-
-bench-xy: build
-	$(IN_OWN_DOMAIN) $(VENV) benchmarks/xy_stage.py
 
 bench-readme: build
 	$(IN_OWN_DOMAIN) $(VENV) -m benchmarks.readme_steps

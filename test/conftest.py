@@ -73,7 +73,8 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         if "nodes" in item.path.parent.name or "rclpy" in getattr(item.module, "__dict__", {}):
             item.add_marker("ros")
         # Simulated devices answer over sockets within time limits, as nodes do.
-        if repeats and (item.get_closest_marker("ros") or item.path.parent.name in DEVICES):
+        devices = item.path.parent.name in DEVICES or "device" in item.path.name
+        if repeats and (item.get_closest_marker("ros") or devices):
             item.add_marker(pytest.mark.flaky(reruns=1, reruns_delay=2))
         if "measured_data" in getattr(item, "fixturenames", ()):
             item.add_marker("measured")

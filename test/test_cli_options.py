@@ -116,6 +116,12 @@ def test_a_slew_limit_near_zero(capsys, folder):
     refused(capsys, folder, *EXCITE, "--voltage-max", "9", "--slew-limit", "1e-30")
 
 
+@pytest.mark.parametrize("more", [(), ("--for-response",), ("--for-path", "no such path")])
+@pytest.mark.parametrize("rate", ["0", "-0.0", "-5", "nan", "inf"])
+def test_a_drive_at_no_rate(rate, more, capsys, folder):
+    assert "--rate" in refused(capsys, folder, *EXCITE, "--voltage-max", "9", f"--rate={rate}", *more)
+
+
 def subparsers():
     whole = parser()
     (found,) = (action for action in whole._actions if isinstance(action, argparse._SubParsersAction))

@@ -1,5 +1,6 @@
 """``slpi excite``: excitation voltages for an identification."""
 
+import math
 from argparse import ArgumentParser, Namespace
 from typing import TYPE_CHECKING
 
@@ -66,7 +67,9 @@ def run(options: Namespace) -> Result:
         raise UsageError("--model is of use with --for-path only; give the path, or leave it out")
     if options.for_response and (options.for_path or options.drive != DRIVES[0]):
         raise UsageError("--for-response is a drive of its own; leave --for and --for-path out")
-    path, rate = _path_of(options) if options.for_path else ({}, options.rate or RATE)
+    if options.rate is not None and not 0.0 < options.rate < math.inf:
+        raise UsageError(f"--rate {options.rate:g}: give a positive number of Hz")
+    path, rate = _path_of(options) if options.for_path else ({}, RATE if options.rate is None else options.rate)
     axes = options.axis or list(path) or ["x"]
     common.require_axis_names(axes)
     options.remarks += allow_table(options.output, table_header(axes, "V"), overwrite=options.overwrite)
@@ -122,7 +125,7 @@ def _path_of(options: Namespace) -> tuple[dict[str, "FloatArray"], float]:
     farthest = max(float(np.abs(y).max()) for y in desired.values())
     if farthest > FARTHEST:
         raise UsageError(f"{options.for_path}: a displacement of {farthest:.4g} m; give metres")
-    rate = options.rate or max(RATE, 1.0 / float(np.median(steps[steps > 0.0])))
+    rate = max(RATE, 1.0 / float(np.median(steps[steps > 0.0]))) if options.rate is None else options.rate
     if options.model:
         model = load_model(options.model)
         try:

@@ -84,7 +84,8 @@ def run(options: Namespace) -> Result:
         if folder:
             report.write_files(folder, found)
         if folder and options.certificate:
-            certificates.write_files(folder, certificates.certificate(done, options.bags, model, options.model))
+            bags = [record.source for record in done.records]
+            certificates.write_files(folder, certificates.certificate(done, bags, model, options.model))
     if found.passed:
         next_command = f"slpi compensate {shlex.quote(options.model)} DESIRED.csv -o VOLTAGE.csv"
     elif found.verdict == UNPROVED and not any(done.independent):

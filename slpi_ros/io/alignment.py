@@ -13,6 +13,7 @@ from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import RecordError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.io.record import Record
+from slpi_ros.io.stage_name import same_stage, stage_name
 
 # Longest gap, in median periods, across which values are interpolated.
 _GAP = 10.0
@@ -29,7 +30,7 @@ class Signals:
 
     logged: IntArray  # ns, ascending: recording times
     stamp: IntArray | None  # ns, of the headers; None if no message is stamped
-    frame_id: str  # the first that is not empty
+    frames: Mapping[str, frozenset[str]]  # names of the columns in the messages of each frame id, in their order
     fields: Mapping[str, Mapping[str, FloatArray]]  # ``position``, ``effort``, ``data`` or ``vector``; NaN: not given
     named: bool  # the message type names the columns, otherwise they are ``0``, ``1``, ...
     notes: tuple[str, ...] = ()  # on messages that were left out, or sorted
@@ -39,6 +40,25 @@ class Signals:
     def names(self) -> tuple[str, ...]:
         """Joint names as in the messages; "0", "1", ... if the message type has none."""
         return tuple(next(iter(self.fields.values())))
+
+    def stage(self, axes: Sequence[str], where: str, accept_stage: str = "") -> str:
+        """Return what the messages of `axes` name their stage, "" if nothing; RecordError if they name several.
+
+        What is named `accept_stage` is of the same stage as the others.
+        """
+        # Columns without names may be any axes.
+        chosen = set(axes) if self.named and set(axes) <= set(self.names) else set(self.names)
+        frames = [frame for frame, names in self.frames.items() if names & chosen]
+        # An accepted name is the other name of the same stage.
+        named = sorted(filter(stage_name, frames), key=lambda frame: stage_name(frame) == stage_name(accept_stage))
+        for other in named[1:]:
+            if not same_stage(named[0], other, accept_stage):
+                raise RecordError(
+                    f"{where}: messages of two stages, '{named[0]}' and '{other}'; record one stage alone, read the "
+                    "axes of one (--axis), or, if both names are of the same stage, accept one for the other "
+                    f"(--accept-stage '{other}')"
+                )
+        return next(iter(named or filter(None, frames)), "")
 
 
 @dataclass(frozen=True)
@@ -69,12 +89,26 @@ class _Series:
     columns: Mapping[str, FloatArray]
 
 
-def combine(voltage: Signals, displacement: Signals, topics: SeparateTopics, axes: Sequence[str], path: Path) -> Record:
-    """Combine the signals of two topics into a record of `axes`, by name, or in the order of columns; empty for all."""
+def combine(
+    voltage: Signals,
+    displacement: Signals,
+    topics: SeparateTopics,
+    axes: Sequence[str],
+    path: Path,
+    accept_stage: str = "",
+) -> Record:
+    """Combine the signals of two topics into a record of `axes`, by name, or in the order of columns; empty for all.
+
+    What is named `accept_stage` is of the same stage as the other messages of its topic.
+    """
     where = f"{path}: voltage on '{topics.voltage}', displacement on '{topics.displacement}'"
     v_columns = _filled(voltage, ("effort", "position", "data", "vector"), where)
     d_columns = _filled(displacement, ("position", "data", "vector"), where)
     wanted = tuple(axes) or _common_axes(voltage, displacement)
+    moves, drives = (
+        signals.stage(wanted, f"{path}, topic '{topic}'", accept_stage)
+        for signals, topic in ((displacement, topics.displacement), (voltage, topics.voltage))
+    )
     moved = assigned(d_columns, displacement.named, wanted, f"{where}: displacement", alone=False)
     driven = assigned(v_columns, voltage.named, wanted, f"{where}: voltage", alone=True)
     v_time, d_time, notes = _times(voltage, displacement, topics, where)
@@ -87,7 +121,7 @@ def combine(voltage: Signals, displacement: Signals, topics: SeparateTopics, axe
         voltage=v,
         displacement=y,
         source=str(path),
-        hardware_id=displacement.frame_id or voltage.frame_id,
+        hardware_id=moves or drives,
         notes=(
             *dict.fromkeys((*voltage.notes, *displacement.notes)),
             *notes,

@@ -43,6 +43,7 @@ def read_bag(
     *,
     axes: Sequence[str] | None = None,
     surroundings: Sequence[str] | None = None,
+    accept_stage: str = "",
 ) -> Record:
     """Read voltage and displacement of a stage from a bag, and the quantities that were recorded beside them.
 
@@ -60,6 +61,9 @@ def read_bag(
         ``RelativeHumidity``, ``FluidPressure``, ``std_msgs/Float64`` and ``geometry_msgs/WrenchStamped`` that is none
         of the stage's own topics, and joint states of other stages. Fields are ``force.z`` of a wrench and
         ``position.x`` of a joint state.
+    accept_stage : str
+        What is named so is of the same stage as the other messages of the topic. Default none: the messages of the
+        axes may name one stage only.
 
     Returns
     -------
@@ -70,7 +74,8 @@ def read_bag(
     Raises
     ------
     RecordError
-        If there is no such bag, topic or axis, or the bag cannot be read; the message names the remedy.
+        If there is no such bag, topic or axis, the bag cannot be read, or the messages are of several stages; the
+        message names the remedy.
     """
     path = Path(path)
     sources = locate(path)
@@ -78,24 +83,26 @@ def read_bag(
         if isinstance(topic, SeparateTopics):
             voltage = bag.read(topic.voltage, MESSAGE_TYPES)
             displacement = bag.read(topic.displacement, MESSAGE_TYPES)
-            record = combine(voltage, displacement, topic, axes or (), path)
+            record = combine(voltage, displacement, topic, axes or (), path, accept_stage)
             taken = [bag.full_name(name) for name in (topic.displacement, topic.voltage)]
             record = _with_surroundings(record, bag, displacement, taken, surroundings)
         else:
             state = bag.read(topic, (JOINT_STATE,))
-            record = _record_of(state, _choose_axes(state, axes, f"{path}, topic '{topic}'"), path)
+            where = f"{path}, topic '{topic}'"
+            chosen = _choose_axes(state, axes, where)
+            record = _record_of(state, chosen, path, state.stage(chosen, where, accept_stage))
             record = _with_surroundings(record, bag, state, [bag.full_name(topic)], surroundings)
         return replace(record, notes=(*record.notes, *bag.notes))
 
 
-def _record_of(state: Signals, chosen: Sequence[str], path: Path) -> Record:
+def _record_of(state: Signals, chosen: Sequence[str], path: Path, stage: str) -> Record:
     unstamped = () if state.stamp is not None else ("time is that of recording: the messages are not stamped",)
     return Record(
         time_ns=state.logged if state.stamp is None else state.stamp,
         voltage={axis: state.fields["effort"][axis] for axis in chosen},
         displacement={axis: state.fields["position"][axis] for axis in chosen},
         source=str(path),
-        hardware_id=state.frame_id,
+        hardware_id=stage,
         notes=(*state.notes, *unstamped),
     )
 
@@ -292,11 +299,11 @@ def _choose_axes(state: Signals, axes: Sequence[str] | None, where: str) -> tupl
 
 def decode_signals(blocks: Iterable[MessageBlock], msgtype: str, expected: int = 0) -> Signals | None:
     """Decode the messages of a topic, None if there is none; blocks are released after decoding."""
-    columns, frame_id = _Columns(expected), ""
+    columns, frames = _Columns(expected), dict[str, frozenset[str]]()
     for block in blocks:
-        frame, part = _decode(block, msgtype)
+        told, part = _decode(block, msgtype)
         columns.append(part)
-        frame_id = frame_id or frame
+        _note(frames, told)
     if not columns.count:
         return None
     arrays = columns.arrays()
@@ -311,12 +318,13 @@ def decode_signals(blocks: Iterable[MessageBlock], msgtype: str, expected: int =
         if field:
             fields[field][name] = array
     stamp = arrays[_STAMP] if stamped else None
-    return Signals(arrays[_LOGGED], stamp, frame_id, fields, kind.named, tuple(notes), received)
+    return Signals(arrays[_LOGGED], stamp, frames, fields, kind.named, tuple(notes), received)
 
 
 # Key of a column: field and name; for times the field is empty.
 _Key = tuple[str, str]
-_Part = tuple[str, dict[_Key, NDArray[Any]]]
+_Frames = dict[str, frozenset[str]]
+_Part = tuple[_Frames, dict[_Key, NDArray[Any]]]
 _LOGGED, _STAMP = ("", "logged"), ("", "stamp")
 _MOST_EXPECTED = 10_000_000
 
@@ -356,6 +364,17 @@ class _Columns:
         return {key: array[: self.count] for key, array in self._arrays.items()}
 
 
+def _note(frames: _Frames, told: Mapping[str, Collection[str]]) -> None:
+    """Add the names of the columns by frame id to those of earlier messages."""
+    for frame, names in told.items():
+        known = frames.get(frame)
+        if known is None and len(frames) > MOST_AXES:
+            # Two names of stages tell as much.
+            continue
+        if known is None or not known.issuperset(names):
+            frames[frame] = (known or frozenset()).union(names)
+
+
 def _decode(block: MessageBlock, msgtype: str) -> _Part:
     if not isinstance(block.messages, list):
         first = read_message(block.messages[0].tobytes(), msgtype)
@@ -366,18 +385,18 @@ def _decode(block: MessageBlock, msgtype: str) -> _Part:
 
 
 def _alike(block: MessageBlock, first: Message, rows: NDArray[np.void]) -> _Part:
-    """Return frame id and columns of a block of messages that all have the layout of the first one."""
+    """Return frames and columns of a block of messages that all have the layout of the first one."""
     stamp = np.zeros(rows.size, np.int64)
     if "sec" in first.layout.fields:
         stamp = rows["sec"].astype(np.int64) * SECOND_NS + rows["nanosec"]
     columns: dict[_Key, NDArray[Any]] = {_LOGGED: block.logged, _STAMP: stamp}
     for field in first.values:
         columns |= {(field, name): rows[field][:, place] for place, name in enumerate(first.names)}
-    return first.frame_id, columns
+    return {first.frame_id: frozenset(first.names)}, columns
 
 
 def _each(block: MessageBlock, msgtype: str, messages: Sequence[Message]) -> _Part:
-    """Return frame id and columns of messages of different layouts, whose numbers are assigned by name."""
+    """Return frames and columns of messages of different layouts, whose numbers are assigned by name."""
     stamp = np.array([message.stamp_ns for message in messages], np.int64)
     columns: dict[_Key, NDArray[Any]] = {_LOGGED: block.logged, _STAMP: stamp}
     names = dict.fromkeys(name for message in messages for name in message.names)
@@ -391,4 +410,7 @@ def _each(block: MessageBlock, msgtype: str, messages: Sequence[Message]) -> _Pa
             # zip stops at the shorter sequence: names beyond the end of an array have no value.
             for name, number in zip(message.names, numbers, strict=False):
                 columns[field, name][row] = number
-    return next((message.frame_id for message in messages if message.frame_id), ""), columns
+    frames = _Frames()
+    for message in messages:
+        _note(frames, {message.frame_id: message.names})
+    return frames, columns

@@ -54,6 +54,14 @@ RESOLUTION = 2e-4
 
 
 @dataclass(frozen=True)
+class FittedRecord:
+    """A record that a model was identified from."""
+
+    source: str
+    sha256: str | None = None  # of its readings, see `slpi_ros.io.digests.record_digest`; None: unknown
+
+
+@dataclass(frozen=True)
 class FitQuality:
     """Free-run error of the model on the record, or records, `source` of its identification, at `samples` samples."""
 
@@ -71,11 +79,19 @@ class FitQuality:
     duration: float | None = None  # s, of the longest record
     left_out_rms: float | None = None  # m, of records that were not fitted; None: there was only one
     verdict: str | None = None  # of the diagnosis that extended it; None: none did
+    records: tuple[FittedRecord, ...] | None = None  # None: unknown, as in older documents
+
+    @property
+    def fitted(self) -> tuple[FittedRecord, ...]:
+        """The records, as far as they are known."""
+        return self.records or tuple(map(FittedRecord, self.source.split(", ")))
 
     @property
     def sources(self) -> list[str]:
         """Names of the records."""
-        return self.source.split(", ")
+        if self.records is None:
+            return self.source.split(", ")
+        return list(dict.fromkeys(record.source for record in self.records))
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from slpi_ros.hysteresis import kinds
 from slpi_ros.io.atomic_file import all_or_nothing
 from slpi_ros.io.input_limits import MODEL_BYTES, read_input
 from slpi_ros.io.schemas import validate
-from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
+from slpi_ros.model.axis_model import AxisModel, FitQuality, FittedRecord, Start
 from slpi_ros.model.sensor import Sensor
 from slpi_ros.model.stage_model import StageModel
 
@@ -22,7 +22,7 @@ SCHEMA, EARLIER, RETIRED = "slpi_ros/model/3", "slpi_ros/model/2", "slpi_ros/mod
 # Names of the fields of `FitQuality`, in order; those from the fastest rate on are optional.
 QUALITY = (
     "rms_m", "maximum_m", "held_out_rms_m", "floor_rms_m", "samples", "covered", "source", "fastest_V_per_s",
-    "regions_m", "drift_m_per_root_s", "duration_s", "left_out_rms_m", "verdict",
+    "regions_m", "drift_m_per_root_s", "duration_s", "left_out_rms_m", "verdict", "records",
 )  # fmt: skip
 
 
@@ -124,7 +124,11 @@ def _axis_from(axis: dict[str, Any]) -> AxisModel:
 def _quality_from(quality: dict[str, Any]) -> FitQuality:
     given: list[Any] = [quality.get(key) for key in QUALITY]
     found = FitQuality(*given)
-    return replace(found, regions=tuple(found.regions)) if found.regions is not None else found
+    if "regions_m" in quality:
+        found = replace(found, regions=tuple(quality["regions_m"]))
+    if "records" in quality:
+        found = replace(found, records=tuple(FittedRecord(**record) for record in quality["records"]))
+    return found
 
 
 def _start_from(start: dict[str, Any]) -> Start:
@@ -141,6 +145,9 @@ def _axis_document(axis: AxisModel) -> dict[str, Any]:
     quality = dict(zip(QUALITY, asdict(axis.quality).values(), strict=True))
     if axis.quality.regions is not None:
         quality["regions_m"] = list(axis.quality.regions)
+    if axis.quality.records is not None:
+        given = [(record.source, record.sha256) for record in axis.quality.records]
+        quality["records"] = [{"source": source} | ({"sha256": sha256} if sha256 else {}) for source, sha256 in given]
     return {
         "kind": axis.kind,
         "voltage_range_V": list(axis.voltage_range),

@@ -6,15 +6,18 @@ from dataclasses import dataclass, replace
 from slpi_ros.diagnosis import diagnose as diagnosis
 from slpi_ros.diagnosis.result import Diagnosis
 from slpi_ros.io.record import Record
+from slpi_ros.model.axis_model import FittedRecord
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.workflows.records import (
     Findings,
     Source,
+    fitted_record,
     mismatch_in_data,
     require_causes,
     require_for_model,
     shared_axes,
     with_given_names,
+    with_records,
 )
 
 
@@ -39,11 +42,24 @@ class DiagnoseOutcome:
 def diagnose(request: DiagnoseRequest) -> DiagnoseOutcome:
     """Find the causes of the errors of a model."""
     source = request.source
-    model = with_given_names(request.model, source.bags, request.model_file)
-    records = source.read(coupled=True, stage=model.hardware_id)
+    records = source.read(coupled=True, stage=request.model.hardware_id)
+    model = with_given_names(request.model, records, source, request.model_file)
     with mismatch_in_data():
         source = replace(source, axes=shared_axes(records, model, source))
         found = require_for_model(records, model, source)
         require_causes(records, source)
         told = diagnosis.diagnose(records, model, axes=source.axes, start=source.start, stop=source.stop)
-    return DiagnoseOutcome(told, records, found)
+    extended = with_records(told.extended, _fitted(told.extended, model, records))
+    return DiagnoseOutcome(replace(told, extended=extended), records, found)
+
+
+def _fitted(extended: StageModel, model: StageModel, records: Sequence[Record]) -> dict[str, list[FittedRecord]]:
+    """Return the records of each axis that was extended."""
+    names = {record.source for record in records}
+    fitted = {}
+    for axis, one in extended.axes.items():
+        if one.quality is not model.axes[axis].quality:
+            # The calibrator diagnoses parts of its bags, by the names of the whole ones.
+            before = [each for each in model.axes[axis].quality.records or () if each.source in names]
+            fitted[axis] = [*before, *(fitted_record(record, axis) for record in records)]
+    return fitted

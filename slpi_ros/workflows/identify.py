@@ -9,7 +9,14 @@ from slpi_ros.identification.uncertainty import CurveUncertainty, curve_uncertai
 from slpi_ros.io.record import Record
 from slpi_ros.model.sensor import IDEAL, Sensor, corrected
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.workflows.records import Findings, Source, require_causes, require_records
+from slpi_ros.workflows.records import (
+    Findings,
+    Source,
+    fitted_record,
+    require_causes,
+    require_records,
+    with_records,
+)
 
 
 @dataclass(frozen=True)
@@ -75,4 +82,5 @@ def identify(request: IdentifyRequest) -> IdentifyOutcome:
 
         require_causes(records, source)
         model, unmoved = following(records, model, **source.span)
-    return IdentifyOutcome(request, model, records, found, unmoved)
+    fitted = {axis: [fitted_record(record, axis) for record in records] for axis in model.axes}
+    return IdentifyOutcome(request, with_records(model, fitted), records, found, unmoved)

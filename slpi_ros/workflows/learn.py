@@ -84,7 +84,11 @@ def learn(request: LearnRequest) -> LearnOutcome:
     remarks: list[str] = []
     for bag, record in read:
         others = 0
-        asked = [one for one in (read_desired(bag, record.axes) if bag else []) if one.axis in axes]
+        read_paths = read_desired(bag, record.axes) if bag else []
+        asked = [one.followed for one in read_paths if one.axis in axes]
+        broken = {one.since_ns for one in asked if one.linear and not one.complete}
+        if broken and request.period is None:
+            remarks.append(f"{record.source}: {len(broken)} passes were cancelled or replaced, and are left out")
         for begun in _passes(request, record, asked, axes):
             if learner is None:
                 learner, told = _learner(request, record, begun, axes)
@@ -116,7 +120,7 @@ def _passes(
     if request.period is None and trajectories:
         ordered = sorted(trajectories, key=lambda one: int(one.time_ns[0]))
         groups = groupby(ordered, key=lambda one: int(one.time_ns[0]))
-        each = [(start_ns, list(paths)) for start_ns, paths in groups]
+        each = [(ns, [one.whole for one in paths if one.complete]) for ns, paths in groups]
         return [_Begun(ns, paths) for ns, paths in each if {one.axis for one in paths} >= set(axes)]
     period = request.period or _duration(request)
     if period is None:

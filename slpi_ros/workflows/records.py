@@ -3,8 +3,9 @@
 import os
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -12,11 +13,14 @@ from slpi_ros.diagnosis.prepare import no_cause, uncovered
 from slpi_ros.errors import IdentificationError, ModelError, RecordError, SlpiError, UsageError
 from slpi_ros.identification.record_quality import Finding, assess, findings, require_usable
 from slpi_ros.io.alignment import SeparateTopics
+from slpi_ros.io.bag_files import locate
 from slpi_ros.io.bag_reader import read_bag, require_different, require_one_stage
+from slpi_ros.io.digests import record_digest
 from slpi_ros.io.record import OUT_OF_ORDER, Course, Record, first_step_back
 from slpi_ros.io.stage_name import same_stage
 from slpi_ros.io.surroundings import clean, named_in
-from slpi_ros.model.axis_model import AxisModel
+from slpi_ros.io.unfinished_bags import place_of
+from slpi_ros.model.axis_model import FitQuality, FittedRecord
 from slpi_ros.model.sensor import IDEAL, Sensor, corrected
 from slpi_ros.model.stage_model import StageModel
 
@@ -58,7 +62,7 @@ class Source:
         """
         if self.records:
             return tuple(_with_chosen(record, self.surroundings) for record in self.records)
-        records = tuple(self._ordered(self._read(str(bag), coupled)) for bag in require_different(self.bags))
+        records = tuple(self._ordered(self.read_bag(str(bag), coupled=coupled)) for bag in require_different(self.bags))
         if self.accept_stage:
             names = (record.hardware_id for record in records)
             others = (name for name in names if name and not same_stage(name, self.accept_stage))
@@ -70,16 +74,21 @@ class Source:
         require_one_stage(records)
         return records
 
-    def _read(self, bag: str, coupled: bool) -> Record:
+    def read_bag(self, bag: str, *, coupled: bool) -> Record:
+        """Return the record of a bag, as of `read`."""
+
+        def read(axes: Sequence[str] | None) -> Record:
+            return read_bag(bag, self.topic, axes=axes, surroundings=self.surroundings, accept_stage=self.accept_stage)
+
         # Separate topics may not name their axes; their names are then those of the request.
         if not coupled or (self.axes and isinstance(self.topic, SeparateTopics)):
-            return read_bag(bag, self.topic, axes=self.axes, surroundings=self.surroundings)
+            return read(self.axes)
         try:
-            return read_bag(bag, self.topic, surroundings=self.surroundings)
+            return read(None)
         except RecordError:
             if not self.axes:
                 raise
-            return read_bag(bag, self.topic, axes=self.axes, surroundings=self.surroundings)
+            return read(self.axes)
 
     def _ordered(self, record: Record) -> Record:
         """Return a record without what comes after stamps that go back, where `stop` leaves it out anyway."""
@@ -95,20 +104,95 @@ class Source:
         return self if self.surroundings is not None or model.quantities else replace(self, surroundings=())
 
 
-def with_given_names(model: StageModel, bags: Sequence[str], model_file: str | None) -> StageModel:
-    """Return a model with the names of its records as `bags` are given; those of the calibrator are beside its file."""
-    here = {os.path.realpath(bag): str(Path(bag)) for bag in bags}
+def fitted_record(record: Record, axis: str) -> FittedRecord:
+    """Return by what a record is recognised from which an axis was identified."""
+    key = "sha256", axis
+    if key not in record.derived:
+        record.derived[key] = record_digest(record, axis)
+    return FittedRecord(record.source, record.derived[key])
+
+
+def with_records(model: StageModel, fitted: Mapping[str, Sequence[FittedRecord]]) -> StageModel:
+    """Return a model with the records from which some axes were identified; of the other axes they stay."""
+    axes = dict(model.axes)
+    for name, records in fitted.items():
+        source = ", ".join(dict.fromkeys(record.source for record in records))
+        quality = replace(axes[name].quality, source=source, records=tuple(dict.fromkeys(records)))
+        axes[name] = replace(axes[name], quality=quality)
+    return replace(model, axes=axes)
+
+
+def with_given_names(
+    model: StageModel, records: Sequence[Record], source: Source, model_file: str | None
+) -> StageModel:
+    """Return a model of which the records that were read from `source` have the names that they have there.
+
+    They are recognised by their readings, wherever and however their bags are kept, and where a document does not tell
+    these, by the place of their bags; those of the calibrator are beside its `model_file`. No other record of the model
+    keeps the name of one of `source`.
+    """
+    if source.records:
+        return model
     places = ["", *([] if model_file is None else [os.path.dirname(model_file)])]
+    bags = [_Bag(record, str(bag), source) for bag, record in zip(source.bags, records, strict=True)]
+    taken = {record.source for record in records}
 
-    def named(source: str) -> str:
-        # A name out of a document need not be one of a file.
-        paths = [] if "\0" in source else [os.path.realpath(os.path.join(at, source)) for at in places]
-        return next((here[path] for path in paths if path in here), source)
+    def named(fitted: FittedRecord, axis: str) -> FittedRecord:
+        for bag in bags:
+            if bag.is_that_of(fitted, axis, places):
+                return replace(fitted, source=bag.record.source)
+        return replace(fitted, source=f"{fitted.source} (earlier)") if fitted.source in taken else fitted
 
-    def of(axis: AxisModel) -> AxisModel:
-        return replace(axis, quality=replace(axis.quality, source=", ".join(map(named, axis.quality.sources))))
+    def known(quality: FitQuality) -> Sequence[FittedRecord]:
+        # A comma may also be of the name of a bag.
+        whole = quality.records is None and any(_files_of(quality.source, at) for at in places)
+        return [FittedRecord(quality.source)] if whole else quality.fitted
 
-    return replace(model, axes={name: of(axis) for name, axis in model.axes.items()})
+    return with_records(
+        model, {name: [named(one, name) for one in known(axis.quality)] for name, axis in model.axes.items()}
+    )
+
+
+@dataclass(frozen=True)
+class _Bag:
+    """A bag that was read, as a record of which a model may have been identified."""
+
+    record: Record
+    path: str
+    source: Source
+
+    def is_that_of(self, fitted: FittedRecord, axis: str, places: Sequence[str]) -> bool:
+        """Return whether it is that of a record of a model; `places`: folders in which its path may begin."""
+        if fitted.sha256 is None:
+            files = _files_of(self.path)
+            return fitted.source == self.record.source or any(files & _files_of(fitted.source, at) for at in places)
+        own = axis in self.record.axes and fitted_record(self.record, axis).sha256 == fitted.sha256
+        return own or (axis, fitted.sha256) in self.related
+
+    @cached_property
+    def related(self) -> set[tuple[str, str | None]]:
+        """Axis and SHA-256 of the whole of a split bag, if this is a part of it, and of its parts, if it is the whole."""
+        place, found = place_of(Path(self.path)), set[tuple[str, str | None]]()
+        whole, files = place.parent if place.is_file() else place, set[str]()
+        if (whole / "metadata.yaml").is_file():
+            files = _files_of(str(whole))
+        if place.is_file():
+            others = [str(whole)] if len(files) > 1 and os.path.realpath(place) in files else []
+        else:
+            others = sorted(files) if len(files) > 1 else []
+        for other in others:
+            with suppress(SlpiError):
+                record = replace(self.source, surroundings=()).read_bag(other, coupled=True)
+                found |= {(axis, fitted_record(record, axis).sha256) for axis in record.axes}
+        return found
+
+
+def _files_of(bag: str, folder: str = "") -> set[str]:
+    """Return the files of a bag, whose path begins in a folder, without links; none if there is no bag."""
+    # A name out of a document need not be one of a file.
+    with suppress(SlpiError, OSError, ValueError):
+        return {os.path.realpath(file) for file in locate(Path(folder, bag))} if bag else set()
+    return set()
 
 
 def _with_chosen(record: Record, chosen: Sequence[str] | None) -> Record:

@@ -8,7 +8,14 @@ from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.refit import AxisChange
 from slpi_ros.io.record import Record
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.workflows.records import Source, require_followed, require_for_model, shared_axes
+from slpi_ros.workflows.records import (
+    Source,
+    fitted_record,
+    require_followed,
+    require_for_model,
+    shared_axes,
+    with_records,
+)
 
 
 @dataclass(frozen=True)
@@ -46,6 +53,8 @@ def refit(request: RefitRequest) -> RefitOutcome:
     require_followed(records, source, model)
     for record in records:
         report_progress(f"refit to {record.source}")
-        model, changes = correction.refit(model, record, axes=source.axes, start=source.start, stop=source.stop)
+        corrected, changes = correction.refit(model, record, axes=source.axes, **source.span)
+        fitted = {axis: [*model.axes[axis].quality.fitted, fitted_record(record, axis)] for axis in changes}
+        model = with_records(corrected, fitted)
         steps.append(RefitStep(record, changes))
     return RefitOutcome(model, steps)

@@ -56,7 +56,7 @@ def verify(request: VerifyRequest) -> VerifyOutcome:
     if not source.records:
         read = zip(source.bags, records, strict=True)
         desired = [desired_of(bag, record, request.desired_topic) for bag, record in read]
-    named = with_given_names(model, source.bags, request.model_file)
+    named = with_given_names(model, records, source, request.model_file)
     own = [] if source.records else [name for axis in named.axes.values() for name in axis.quality.sources]
     with mismatch_in_data():
         source = replace(source, axes=shared_axes(records, model, source))

@@ -22,7 +22,7 @@ def signals(time, columns, *, stamped=True, field="data", named=True, logged=Non
     time = np.asarray(time, np.int64)
     columns = {name: np.asarray(column, float) for name, column in columns.items()}
     logged = time + 7 if logged is None else np.asarray(logged, np.int64)
-    return Signals(logged, time if stamped else None, "", {field: columns}, named)
+    return Signals(logged, time if stamped else None, {}, {field: columns}, named)
 
 
 def aligned(v_time, v, y_time, y, **how):
@@ -276,3 +276,62 @@ def test_a_desired_displacement_of_three_axes_in_a_vector(tmp_path):
     held = desired_of(bag, read_bag(bag), "wanted")
     assert held.keys() == {"x", "y", "z"}
     assert np.allclose(held["z"], 3e-6 * np.arange(60), rtol=0, atol=1e-18)
+
+
+def framed(frames, names=("x",)):
+    """Return states of which each has its frame id and the names of its axes, 10 ms apart."""
+    stamps = [10**9 + k * 10 * MS for k in range(len(frames))]
+    axes = [names] * len(frames) if isinstance(names[0], str) else names
+    return [
+        (stamp, joint_state(stamp, each, [k] * len(each), [-k] * len(each), frame))
+        for k, (stamp, frame, each) in enumerate(zip(stamps, frames, axes, strict=True))
+    ]
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+@pytest.mark.parametrize(
+    "frames", [["A"] * 9 + ["B"] * 9, ["A", "B"] * 9, ["A"] * 17 + ["other"], ["", "A", "map"] * 5 + ["B"]]
+)
+def test_messages_of_two_stages_are_no_record(tmp_path, frames, storage):
+    bag = rosbags_bag(tmp_path / "bag", {"/stage_state": framed(frames)}, storage)
+    other = next(frame for frame in frames if frame not in ("", "map", "A"))
+    said = refusal(RecordError, read_bag, bag)
+    assert holds(said, bag, "'stage_state'", "'A'", f"'{other}'", "--accept-stage")
+    # Whichever of the two is the other name of the same stage.
+    assert read_bag(bag, accept_stage=other).hardware_id == "A"
+    assert read_bag(bag, accept_stage="A").hardware_id == other
+    assert holds(refusal(RecordError, read_bag, bag, accept_stage="a third"), "'A'", f"'{other}'")
+
+
+@pytest.mark.parametrize(
+    ("frames", "stage"),
+    [
+        (["base_link", "A", "/map", "A", "world", ""] * 3, "A"),
+        (["odom", "base_link"] * 9, "odom"),
+        ([""] * 9, ""),
+        (["N, serial number 12, firmware 1", "N, serial number 12, firmware 2"] * 9, "N, serial number 12, firmware 1"),
+    ],
+)  # fmt: skip
+def test_what_names_no_other_stage_may_stand_beside_it(tmp_path, frames, stage):
+    record = read_bag(rosbags_bag(tmp_path / "bag", {"/stage_state": framed(frames)}))
+    assert record.hardware_id == stage and len(record) == len(frames)
+
+
+def test_the_axes_of_one_of_two_stages_on_a_topic_can_be_read(tmp_path):
+    states = framed(["A", "B"] * 9, [("x",), ("y", "z")] * 9)
+    bag = rosbags_bag(tmp_path / "bag", {"/stage_state": states})
+    assert holds(refusal(RecordError, read_bag, bag), "'A'", "'B'", "--axis")
+    assert [read_bag(bag, axes=axes).hardware_id for axes in (["x"], ["y"], ["z", "y"])] == ["A", "B", "B"]
+    refusal(RecordError, read_bag, bag, axes=["x", "z"])
+
+
+@pytest.mark.parametrize("second", ["command", "sensor"])
+def test_each_of_two_topics_is_of_one_stage(tmp_path, second):
+    frames = {"command": ["A"] * 18, "sensor": ["A"] * 18} | {second: ["A", "B"] * 9}
+    bag = rosbags_bag(tmp_path / "bag", {f"/{topic}": framed(names) for topic, names in frames.items()})
+    assert holds(refusal(RecordError, read_bag, bag, BOTH), f"'{second}'", "'A'", "'B'")
+    assert read_bag(bag, BOTH, accept_stage="B").hardware_id == "A"
+    # What a quantity beside the stage names in its frames is no stage.
+    states = {"/stage_state": framed(["A"] * 18), "/other": framed(["B", "C"] * 9)}
+    beside = read_bag(rosbags_bag(tmp_path / "beside", states), surroundings=["/other:position.x"])
+    assert beside.hardware_id == "A" and "/other:position.x" in beside.surroundings

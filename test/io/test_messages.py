@@ -61,7 +61,7 @@ def test_all_at_once_agrees_with_one_by_one(names, frame_id, velocities, data):
     alike = decode(*messages)
     # one more message of another length leaves only the slow way
     each = decode(*messages, serialised(2 * 10**12, [*names, "one more"], [], []))
-    assert alike.frame_id == frame_id
+    assert alike.frames == {frame_id: frozenset(names)}
     stamp = np.zeros(len(drawn)) if alike.stamp is None else alike.stamp
     assert stamp.tolist() == each.stamp[:-1].tolist() == [stamp for stamp, _, _ in drawn]
     for column, name in enumerate(names):

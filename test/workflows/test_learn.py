@@ -50,8 +50,11 @@ def message(start_ns, path):
     return STORE.types[TRAJECTORY](header(start_ns), joint_names=["x"], points=points)
 
 
-def bag_of(folder, path, *, trajectories=True, seed=0, readings=None):
-    """Write a bag of some passes of one path, or of so many readings, each as a trajectory or not told at all."""
+def bag_of(folder, path, *, trajectories=True, seed=0, readings=None, others=()):
+    """Write a bag of some passes of one path, or of so many readings, each as a trajectory or not told at all.
+
+    `others`: further trajectories, each with the number of the reading at which it comes.
+    """
     # The trajectory ends where the next one begins.
     path = np.append(path, path[0])
     whole = np.concatenate([*[path[:-1]] * PASSES, path[-1:]])[:readings]
@@ -65,6 +68,7 @@ def bag_of(folder, path, *, trajectories=True, seed=0, readings=None):
     if trajectories:
         starts = [int(stamps[k * SIZE]) for k in range(PASSES)]
         topics["/desired_trajectory"] = [(ns, message(ns, path)) for ns in starts]
+        topics["/desired_trajectory"] += [(int(stamps[at]), message(int(stamps[at]), other)) for at, other in others]
     return rosbags_bag(folder, topics)
 
 
@@ -144,6 +148,27 @@ def test_passes_of_another_path_are_left_out(model, tmp_path, capsys):
     assert main([*words, *map(str, bags), "--json"]) == 0
     assert len(json.loads(capsys.readouterr().out)["axes"]["x"]["passes"]) == PASSES
     assert np.abs(read_table(nxt, "m")[1]["x"] - y).max() <= 0.1e-6 + 1e-12
+
+
+@pytest.mark.parametrize(
+    ("at", "other", "whole"),
+    [
+        (SIZE // 2, [], PASSES - 1),  # cancelled
+        (3 * SIZE // 2, [9e-6, 9e-6], PASSES - 1),  # replaced
+        (2 * SIZE - 1, [], PASSES - 1),
+        (PASSES * SIZE, [], PASSES),
+    ],
+)
+def test_a_pass_that_is_cancelled_or_replaced_does_not_count(at, other, whole, model, tmp_path, capsys):
+    t, y = desired()
+    write_table(tmp_path / "desired.csv", t, {"x": y}, "m")
+    bag = bag_of(tmp_path / "bag", y, others=[(at, other)])
+    words = ["learn", str(bag), "--model", str(model), "-o", str(tmp_path / "next.csv"), "--json"]
+    for more in ([], ["--desired", str(tmp_path / "desired.csv")]):
+        assert main([*words, *more]) == 0
+        told = capsys.readouterr()
+        assert len(json.loads(told.out)["axes"]["x"]["passes"]) == whole
+        assert ("cancelled or replaced" in told.err) == (whole < PASSES)
 
 
 def test_a_period_that_is_none_of_the_path_is_refused(model, tmp_path):

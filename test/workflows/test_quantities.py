@@ -116,7 +116,7 @@ def test_only_the_named_ones_are_looked_at(bags, followed, tmp_path, capsys):
 @pytest.fixture(scope="module")
 def poor(tmp_path_factory):
     """A bag with quantities that cannot be used: of two readings, of half the time, of another time, and constant."""
-    one = record(offset=GAIN)
+    one = record(offset=GAIN, since=250.0)
     t, values = one.surroundings[TOPIC]
     half, constant = t.size // 2, np.full(t.size, 21.0)
     courses = {

@@ -171,15 +171,14 @@ class _Bag:
 
     @cached_property
     def related(self) -> set[tuple[str, str | None]]:
-        """Axis and SHA-256 of the whole of a split bag, if this is a part of it, and of its parts, if it is the whole."""
+        """Axis and SHA-256 of the whole of a split bag, if this is a part of it, or of its parts, if this is all."""
         place, found = place_of(Path(self.path)), set[tuple[str, str | None]]()
-        whole, files = place.parent if place.is_file() else place, set[str]()
-        if (whole / "metadata.yaml").is_file():
-            files = _files_of(str(whole))
-        if place.is_file():
-            others = [str(whole)] if len(files) > 1 and os.path.realpath(place) in files else []
-        else:
-            others = sorted(files) if len(files) > 1 else []
+        part = place.is_file()
+        whole = place.parent if part else place
+        files = _files_of(str(whole)) if (whole / "metadata.yaml").is_file() else set[str]()
+        if len(files) < 2 or (part and os.path.realpath(place) not in files):
+            return found
+        others = [str(whole)] if part else sorted(files)
         for other in others:
             with suppress(SlpiError):
                 record = replace(self.source, surroundings=()).read_bag(other, coupled=True)

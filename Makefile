@@ -46,7 +46,7 @@ INSTALLED := package.xml setup.py setup.cfg $(wildcard config config/* launch la
 
 help:
 	@echo 'make build      .venv with pinned dependencies (or on top of a sourced ROS 2 Jazzy), then colcon build'
-	@echo 'make test       build, lint, types, docstrings, tests: ten minutes on two cores'
+	@echo 'make test       build, lint, types, docstrings, tests: a quarter of an hour on two cores'
 	@echo 'make test-long  build, then the tests that take long'
 	@echo 'make test-properties  build, then all properties, with four times the examples of make test'
 	@echo 'make test-jazzy    the versions of Ubuntu 24.04 with Python 3.12: the quick tests of make test that depend on them'

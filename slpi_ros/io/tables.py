@@ -187,6 +187,13 @@ def _si(values: Mapping[str, FloatArray], column: Column) -> FloatArray:
     return values[column.name] * column.scale
 
 
+def _goes_back(v: FloatArray) -> bool:
+    """Return whether a voltage goes up and down again, by half of its range at least: else no hysteresis shows."""
+    v = v[np.isfinite(v)]
+    fall, rise = np.max(np.maximum.accumulate(v) - v), np.max(v - np.minimum.accumulate(v))
+    return bool(min(fall, rise) >= 0.5 * np.ptp(v))
+
+
 def _summary(record: Record, desired: Mapping[str, FloatArray], choice: ColumnChoice) -> Iterable[str]:
     """Yield a line for each axis and quantity, and one for what is left out."""
     for axis in record.axes:
@@ -194,7 +201,7 @@ def _summary(record: Record, desired: Mapping[str, FloatArray], choice: ColumnCh
         displacement = _column_summary(choice.displacement[axis], record.displacement[axis] * 1e6, "µm")
         wanted = _column_summary(choice.desired[axis], desired[axis] * 1e6, "µm") if axis in desired else ""
         yield f"axis {axis}: {voltage}, {displacement}{', desired ' + wanted if wanted else ''}"
-        if is_line(record.voltage[axis], record.displacement[axis]):
+        if is_line(record.voltage[axis], record.displacement[axis]) and _goes_back(record.voltage[axis]):
             yield (
                 f"axis {axis}: the displacement is a straight line of '{choice.voltage[axis].name}', without "
                 "hysteresis: is this a monitor of the sensor? The voltage must be that of the drive (--voltage)"

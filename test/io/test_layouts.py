@@ -248,7 +248,7 @@ def test_a_monitor_of_the_sensor_is_told(tmp_path):
     assert any("'Monitor (V)'" in line and "monitor" in line for line in table.summary)
 
 
-@pytest.mark.parametrize("what", ["a loop", "a loop with a spike", "noise", "a line", "a noisy line"])
+@pytest.mark.parametrize("what", ["a loop", "a loop with a spike", "noise", "one rise", "a line", "a noisy line"])
 def test_only_a_line_is_taken_for_a_monitor(tmp_path, what):
     """One damaged reading of 4,000 made a loop a line; so did readings that are nothing but noise."""
     rng = np.random.default_rng(3)
@@ -257,10 +257,13 @@ def test_only_a_line_is_taken_for_a_monitor(tmp_path, what):
         "a loop": moved,
         "a loop with a spike": np.where(np.arange(N) == N // 2, 99.0, moved),
         "noise": rng.normal(0.0, 1.0, N),
+        # Which cannot show any hysteresis.
+        "one rise": 0.1 * np.linspace(0.0, 7.0, N),
         "a line": 0.1 * V,
         "a noisy line": 0.1 * V + rng.normal(0.0, 8e-3, N),
     }[what]
-    rows = [(t, v, y) for (t, v, _), y in zip(ROWS, moved.tolist(), strict=True)]
+    driven = 10.0 * moved if what == "one rise" else V
+    rows = [(t, v, y) for (t, _, _), v, y in zip(ROWS, driven.tolist(), moved.tolist(), strict=True)]
     path = written(tmp_path, "Time (s),x_V,x_um\n" + lines(",", rows=rows, form="{:.6f}"))
     summary = import_with_summary(path, ColumnOptions()).summary
     assert any("monitor" in line for line in summary) == what.endswith("line")

@@ -98,21 +98,21 @@ def test_who_moves_the_axis_of_a_driver_that_reports_right_after_another_one_is_
     save_model(stage_model(("x", "y")), path)
     with compensator(model_file=str(path), start_voltage="auto", axes=["x", "y"], voltage_max=[100.0] * 2,
                      voltage_min=[0.0] * 2, slew_limit=[0.0] * 2) as client:  # fmt: skip
-        node, moved = client.graph.node, []
+        node, moved = client.graph.node, [0.0]
         drivers = [node.create_publisher(JointState, "/stage_state", RELIABLE) for _ in range(2)]
 
         def publish():
             # One right after the other, always in this order.
             at = client.answers[-1] if client.answers else [0.0, 0.0]
-            for driver, axis, v in zip(drivers, ("x", "y"), (at[0], at[1] + sum(moved)), strict=True):
+            by = moved.pop() if len(moved) > 1 else moved[0]
+            for driver, axis, v in zip(drivers, ("x", "y"), (at[0], at[1] + by), strict=True):
                 driver.publish(JointState(name=[axis], position=[0.0], effort=[v]))
 
         node.create_timer(0.01, publish)
         client.graph.spin_until(lambda: insist(client, 0.1), "a voltage")
         client.graph.spin_for(1.5)
-        # For 2 s only: none of some 200 reports may be missed for long.
-        moved.append(20.0)
-        node.create_timer(2.0, moved.clear)
+        # In 200 reports only: they may not be missed for long.
+        moved.extend([20.0] * 200)
         wait_for_obstacle(client, "axis 'y'", "~/arm")
 
 

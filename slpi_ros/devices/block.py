@@ -39,14 +39,20 @@ class BlockState:
     reason: str = ""
 
 
+def block_values(values: Mapping[str, str]) -> tuple[int, int, str] | None:
+    """Return stamp (ns), sample and reason of what a driver says of a block, None if it names no block."""
+    seconds, _, rest = values.get("stamp", "").partition(".")
+    sample = values.get("sample", "")
+    if not (seconds.isdecimal() and rest.isdecimal() and sample.isdecimal()):
+        return None
+    return int(seconds) * SECOND_NS + int(rest), int(sample), values.get("reason", "")
+
+
 def block_state(message: str, values: Mapping[str, str]) -> BlockState | None:
     """Return what a driver says on `voltage_trajectory_state`, None if it is no state of a block."""
-    seconds, _, rest = values.get("stamp", "").partition(".")
-    sample, known = values.get("sample", ""), message in {phase.value for phase in BlockPhase}
-    if not (known and seconds.isdecimal() and rest.isdecimal() and sample.isdecimal()):
-        return None
-    stamp_ns = int(seconds) * SECOND_NS + int(rest)
-    return BlockState(BlockPhase(message), stamp_ns, int(sample), values.get("reason", ""))
+    found = block_values(values)
+    known = message in {phase.value for phase in BlockPhase}
+    return BlockState(BlockPhase(message), *found) if known and found else None
 
 
 def refusal(request: TrajectoryArrays, settings: LoopSettings, present: Sequence[float]) -> str:

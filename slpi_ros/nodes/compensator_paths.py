@@ -8,8 +8,9 @@ from rclpy.node import Node
 from slpi_ros.compensator.block import ACCEPTED, PLAYING
 from slpi_ros.compensator.controller import Controller, OperatingMode, StopReason
 from slpi_ros.compensator.validation import STALE, RejectedError
+from slpi_ros.devices.block import block_values
 from slpi_ros.errors import shown
-from slpi_ros.io.messages import SECOND_NS, TrajectoryArrays, decode_trajectory
+from slpi_ros.io.messages import TrajectoryArrays, decode_trajectory
 from slpi_ros.nodes.common import DeferredService, read_trajectory
 from slpi_ros.nodes.compensator_diagnostics import Reporter
 from slpi_ros.nodes.compensator_memory import Memory
@@ -96,13 +97,11 @@ class Paths:
         listening = self._controller.ownership.listening
         if listening:
             listening.play(status.message in (ACCEPTED, PLAYING), time.monotonic_ns())
-        values = {each.key: each.value for each in status.values}
-        seconds, _, rest = values.get("stamp", "").partition(".")
-        if not (seconds.isdecimal() and rest.isdecimal() and values.get("sample", "").isdecimal()):
+        found = block_values({each.key: each.value for each in status.values})
+        if found is None:
             return
-        stamp_ns, reason = int(seconds) * SECOND_NS + int(rest), values.get("reason", "")
-        sample, now_ns = int(values["sample"]), time.monotonic_ns()
-        if self._controller.hear_block(stamp_ns, status.message, sample, reason, now_ns):
+        stamp_ns, sample, reason = found
+        if self._controller.hear_block(stamp_ns, status.message, sample, reason, time.monotonic_ns()):
             block = self._controller.block
             assert block
             said = f"block {shown(block.state)} at sample {block.sample}{': ' if reason else ''}{shown(reason)}"

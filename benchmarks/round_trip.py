@@ -68,17 +68,15 @@ def compensator(
     namespace: str,
     model: StageModel,
     executor: str = "events",
-    remap: Sequence[str] = (),
     python: str = sys.executable,
     **parameters: object,
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """Run the compensator with a model of both axes; remap topics as in ``from:=to``."""
+    """Run the compensator with a model of both axes."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "stage.json"
         slpi_ros.save_model(model, path)
         given = {"axes": list(AXES), "model_file": str(path), "executor": executor, **parameters}
         options = [part for name, value in given.items() for part in ("-p", f"{name}:={json.dumps(value)}")]
-        options += [part for rule in remap for part in ("-r", rule)]
         with node(
             namespace, "-m", "slpi_ros.nodes.start", "compensator", "--ros-args", *options, python=python
         ) as process:

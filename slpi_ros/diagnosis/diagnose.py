@@ -222,14 +222,15 @@ def _extension(model: AxisModel, answer: Answer, given: Given, source: str) -> _
 def _runs(model: AxisModel, now: JointFit, *, own: bool = False) -> list[FreeRun]:
     """Return the free run of an extended model on each of its records, with what goes on from before it.
 
-    With `own`, also with the effects of each record, such as drift.
+    With `own` instead with the effects of each record, such as drift.
     """
     separate: list[Any] = [effect for effect in now.effects if isinstance(effect, EachRecord)]
     begun = [effect.started(np.zeros_like(now.began.get(effect.name, ())), 2) for effect in model.effects]
     model = replace(model, effects=tuple(begun))
     runs = []
     for k, (part, rows) in enumerate(zip(now.evidence.parts, now.evidence.slices, strict=True)):
-        part = replace(part, y=part.y - now.settling[rows])
+        # What goes on from before a record is unknown where the model is used.
+        part = part if own else replace(part, y=part.y - now.settling[rows])
         added = [each.parts[k] for each in separate if own]
         # An error of the sensor goes with its reading, whose zero is not that of the model.
         for effect in added:
@@ -262,12 +263,12 @@ def _own(model: AxisModel, evidence: Evidence) -> Mask:
 
 
 def _carries_over(after: Sequence[FreeRun], before: Sequence[FreeRun], opponents: Sequence[float]) -> bool:
-    """Return whether an extended model is worse than the given one neither on all records nor than an opponent on one.
+    """Return whether an extended model is no worse than the given one on all records, and than an opponent on each.
 
     `after` and `before` are the free runs of both models, `opponents` the errors (m, rms) on each record.
     """
     on_each = all(one.rms <= NO_WORSE * opponent for one, opponent in zip(after, opponents, strict=True))
-    return on_each and rms_of(after) <= NO_WORSE * rms_of(before)
+    return on_each and rms_of(after) <= rms_of(before)
 
 
 def _answer(base: JointFit, of_family: Evidence | None) -> Answer:

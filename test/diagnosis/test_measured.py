@@ -74,6 +74,20 @@ def test_loops_that_depend_on_bias_are_told_from_drift(measured_data):
     assert axis.after_rms < 0.3 * axis.before_rms
 
 
+@pytest.mark.parametrize("fitted", ["pzt19_2s", pytest.param("ferro_forc", marks=pytest.mark.long)])
+def test_creep_that_needs_a_past_of_its_own_is_not_in_the_model(measured_data, fitted):
+    """A creep from before the record, which no other record has, made a large creep by a power of time fit it."""
+    record = import_table(measured_data / f"{fitted}.csv")
+    if fitted == "ferro_forc":
+        record = record.part(slice(len(record) // 2))
+    model = slpi_ros.identify(record)
+    diagnosis = slpi_ros.diagnose(record, model)
+    (found,) = diagnosis.axes.values()
+    assert found.verdict == "unexplained"
+    assert found.dropped == ("creep",)
+    assert diagnosis.extended.axes == model.axes
+
+
 SINES = "sine_1p02hz", "sine_0p49hz"
 
 

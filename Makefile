@@ -173,6 +173,9 @@ bench-loop-rate: build
 bench-oscillation: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) -m benchmarks.oscillation
 
+bench-tune: build
+	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/tune.py
+
 bench-learning: build
 	OPENBLAS_NUM_THREADS=1 $(VENV) benchmarks/learning.py $(LEARNING)
 

@@ -68,6 +68,13 @@ def services():
     return {one or other for one, other in called} | {each["name"].strip("/") for each in topics}
 
 
+@cache
+def targets():
+    """Return the targets of the Makefile that have a rule."""
+    rules = re.findall(r"^([a-z][\w -]*):(?!=|.*export)", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    return {name for rule in rules for name in rule.split()}
+
+
 def unknown(span):
     """Return the names in a piece of code that do not exist."""
     command = re.match(r"slpi (\w+)", span)
@@ -78,7 +85,9 @@ def unknown(span):
         for option in re.findall(r"(?<!\S)--[a-z][\w-]*", span):
             if option not in options().get(command[1] if command else "", every):
                 yield from () if not command and option[2:].replace("-", "_") in source() else [option]
-    if ":=" in span:
+    if target := re.match(r"make ([a-z][\w-]*)", span):
+        yield from () if target[1] in targets() else [target[1]]
+    elif ":=" in span:
         for kind, name in re.findall(r"(-[pr] )?([\w.]+):=", span):
             known = services() if kind == "-r " else parameters() | arguments()
             yield from () if name.split(".")[0] in known else [name]
@@ -93,6 +102,11 @@ def test_what_a_page_names_exists(page):
     assert not {(span, name) for span in spans(page) for name in unknown(span) if name not in OTHERS}
 
 
+def test_what_the_makefile_promises_has_a_rule():
+    (phony,) = re.findall(r"^\.PHONY: (.*)", (ROOT / "Makefile").read_text(), re.MULTILINE)
+    assert {*phony.split()} - {"FORCE"} == targets()
+
+
 @pytest.mark.parametrize(
     "span",
     [
@@ -103,6 +117,7 @@ def test_what_a_page_names_exists(page):
         "-r x:=y",
         "~/stopp",
         "no_such_name",
+        "make bench-nothing",
     ],
 )
 def test_a_name_that_does_not_exist_is_seen(span):

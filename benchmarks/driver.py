@@ -11,12 +11,10 @@ import math
 import multiprocessing
 import os
 import socket
-import subprocess
 import sys
 import tempfile
 import threading
 import time
-import venv
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -40,7 +38,7 @@ ROWS = (
     ("gcs", 1000.0, 0.0), ("gcs", 1000.0, 0.0003), ("gcs", 500.0, 0.001), ("labjack", 1000.0, 0.0),
     ("labjack", 250.0, 0.001), ("nidaqmx", 500.0, 0.0), ("nv200", 200.0, 0.001),
 )  # fmt: skip
-# The row beside which the bare socket and pipython are measured.
+# The row beside which the bare socket is measured.
 BESIDE = ROWS[1]
 # Of the simulated device, and of the driver where it has one: as in ROS 2 control.
 DEVICE_PRIORITY, PRIORITY = 60, 50
@@ -163,29 +161,11 @@ def bare(address, rate, seconds):
     return Row(len(lateness), elapsed, used, tuple(shares))
 
 
-def pipython(address, rate, seconds, folder):
-    """Return the rows of PI's own library, in an environment made for it: as it comes, and without its error check."""
-    place = Path(folder) / "environment"
-    venv.create(place, with_pip=True)
-    python = place / "bin" / "python"
-    subprocess.run([python, "-m", "pip", "install", "-q", "--disable-pip-version-check", "pipython"], check=True)
-    script = Path(__file__).with_name("driver_pipython.py")
-    command = [python, script, address, str(rate), str(seconds)]
-    done = subprocess.run(command, check=True, capture_output=True, text=True, env={})
-    rows = [list(map(float, line.split())) for line in done.stdout.splitlines()]
-    return [Row(cycles, elapsed, used, tuple(lateness)) for cycles, elapsed, used, *lateness in rows]
-
-
 def main():
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=5.0, help="of each row")
     parser.add_argument("--device", choices=DEVICES, help="only this one")
     parser.add_argument("--pairs", type=int, default=1, help="how often each row is measured")
-    parser.add_argument(
-        "--pipython",
-        action="store_true",
-        help="also PI's library, installed for this run alone; by its licence it is for PI's hardware",
-    )
     given = parser.parse_args()
     load = ", ".join(f"{each:.1f}" for each in os.getloadavg())
     print(f"{os.cpu_count()} processors; load of the last 1, 5 and 15 minutes: {load}")
@@ -198,11 +178,6 @@ def main():
             with served(name, delay, folder) as address:
                 for _ in range(given.pairs):
                     measure(row, address, given.seconds)
-                if given.pipython and row == BESIDE:
-                    for checked, measured in zip(
-                        (True, False), pipython(address, rate, given.seconds, folder), strict=True
-                    ):
-                        print(measured.told(f"pipython{'' if checked else ', no ERR?'}", rate, delay), flush=True)
     print(f"load at the end: {os.getloadavg()[0]:.1f}", file=sys.stderr)
 
 

@@ -1,4 +1,4 @@
-"""What a diagnosis makes of what the sensor does: short forms of benchmarks/sensors.py."""
+"""What a diagnosis makes of what the sensor does: coarse, late, mixed and clipped readings."""
 
 import re
 

@@ -1,12 +1,11 @@
 """``slpi compensate``: the voltage for a desired displacement."""
 
-import math
 from argparse import ArgumentParser, Namespace
 from typing import Any
 
 from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Result, command_line
-from slpi_ros.errors import SlpiError, UsageError
+from slpi_ros.errors import SlpiError
 
 HELP = "compute the voltage for a desired displacement"
 EXAMPLE = "slpi compensate model.json desired.csv -o voltage.csv --slew-limit 1000"
@@ -24,12 +23,7 @@ def add_options(command: ArgumentParser) -> None:
         "table", metavar="DESIRED.csv", help="columns time_s, <axis>_m, and <topic> of quantities that it follows"
     )
     common.add_output(command, "VOLTAGE.csv", "columns time_s, <axis>_V")
-    command.add_argument("--voltage-min", metavar="V", type=float, default=-math.inf, help="default: identified range")
-    command.add_argument("--voltage-max", metavar="V", type=float, default=math.inf, help="default: identified range")
-    command.add_argument(
-        "--slew-limit", "--slew", dest="slew_limit", metavar="V/S", type=float, default=0.0,
-        help="rate limit; the voltage then begins where the stage is; 0 (default): no limit",
-    )  # fmt: skip
+    common.add_inverse_limits(command, "rate limit; the voltage then begins where the stage is")
     command.add_argument(
         "--start-memory", choices=START_MEMORIES, default=START_MEMORIES[0],
         help="initial state of the stage: as at the end of the identified record (default), as at its start, "
@@ -45,7 +39,7 @@ def run(options: Namespace) -> Result:
     from slpi_ros.io.tables import read_table_with, table_header, write_table
     from slpi_ros.model.coverage import path_beyond
     from slpi_ros.model.document import load_model
-    from slpi_ros.model.limits import MAX_DT, Limits
+    from slpi_ros.model.limits import MAX_DT
     from slpi_ros.model.stage_model import check_time, held_message
     from slpi_ros.reports.text import describe_start
 
@@ -55,11 +49,9 @@ def run(options: Namespace) -> Result:
     check_time(t)
     known = common.model_columns(desired, model, options.table)
     options.remarks += allow_table(options.output, table_header(known, "V"), overwrite=options.overwrite)
-    if options.slew_limit < 0.0 or math.isnan(options.slew_limit):
-        raise UsageError(f"--slew-limit {options.slew_limit:g}: give a positive number of V/s, or 0 for no limit")
+    limits = common.inverse_limits(options)
     common.require_usable(model, surroundings, options.table)
     options.remarks += common.quantities_beyond(model, t, surroundings)
-    limits = Limits(options.voltage_min, options.voltage_max, options.slew_limit or math.inf)
     try:
         answers = model.command(t, known, limits, options.start_memory, surroundings)
     except SlpiError as error:

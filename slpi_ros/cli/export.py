@@ -1,11 +1,9 @@
 """``slpi export``: the causal inverse of a model as C source, or as an FMU."""
 
-import math
 from argparse import ArgumentParser, Namespace
 
 from slpi_ros.cli import options as common
 from slpi_ros.cli.command import Result
-from slpi_ros.errors import UsageError
 
 HELP = "write the causal inverse of a model as C source or as an FMU"
 EXAMPLE = "slpi export model.json -o controller --slew-limit 1000"
@@ -24,11 +22,7 @@ def add_options(command: ArgumentParser) -> None:
     command.add_argument(
         "--gains", metavar="GAINS.yaml", help="also export the feedback with the gains of slpi tune; default: none"
     )
-    command.add_argument("--voltage-min", metavar="V", type=float, default=-math.inf, help="default: identified range")
-    command.add_argument("--voltage-max", metavar="V", type=float, default=math.inf, help="default: identified range")
-    command.add_argument(
-        "--slew-limit", metavar="V/S", type=float, default=0.0, help="rate limit; 0 (default): no limit"
-    )
+    common.add_inverse_limits(command, "rate limit")
 
 
 def run(options: Namespace) -> Result:
@@ -36,12 +30,9 @@ def run(options: Namespace) -> Result:
     from slpi_ros.export.stage import ExportedStage
     from slpi_ros.export.targets import TARGETS
     from slpi_ros.model.document import load_model
-    from slpi_ros.model.limits import Limits
 
-    if options.slew_limit < 0.0 or math.isnan(options.slew_limit):
-        raise UsageError(f"--slew-limit {options.slew_limit:g}: give a positive number of V/s, or 0 for no limit")
+    limits = common.inverse_limits(options)
     model = load_model(options.model)
-    limits = Limits(options.voltage_min, options.voltage_max, options.slew_limit or math.inf)
     stage, target = ExportedStage.of(model, limits, options.axis), TARGETS[options.target]
     if options.gains is not None:
         from slpi_ros.compensator.gains_file import TunedGains

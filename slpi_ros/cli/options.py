@@ -14,6 +14,7 @@ from slpi_ros.errors import SlpiError, UsageError
 if TYPE_CHECKING:
     from slpi_ros.arrays import FloatArray
     from slpi_ros.io.alignment import SeparateTopics
+    from slpi_ros.model.limits import Limits
     from slpi_ros.model.stage_model import StageModel
     from slpi_ros.workflows.records import Source
 
@@ -116,6 +117,23 @@ def add_limits(command: ArgumentParser, slew: str) -> None:
     command.add_argument("--voltage-max", metavar="V", type=float, required=True, help="highest voltage")
     text = f"{slew}; default: the voltage range in 0.1 s; 0: no limit"
     command.add_argument("--slew-limit", "--slew", dest="slew_limit", metavar="V/S", type=float, help=text)
+
+
+def add_inverse_limits(command: ArgumentParser, slew: str) -> None:
+    """Add the limits of an inverse; `slew` describes the slew limit."""
+    command.add_argument("--voltage-min", metavar="V", type=float, default=-math.inf, help="default: identified range")
+    command.add_argument("--voltage-max", metavar="V", type=float, default=math.inf, help="default: identified range")
+    text = f"{slew}; 0 (default): no limit"
+    command.add_argument("--slew-limit", "--slew", dest="slew_limit", metavar="V/S", type=float, default=0.0, help=text)
+
+
+def inverse_limits(options: Namespace) -> "Limits":
+    """Return the limits that the options give; UsageError for an impossible slew limit."""
+    from slpi_ros.model.limits import Limits
+
+    if not options.slew_limit >= 0.0:
+        raise UsageError(f"--slew-limit {options.slew_limit:g}: give a positive number of V/s, or 0 for no limit")
+    return Limits(options.voltage_min, options.voltage_max, options.slew_limit or math.inf)
 
 
 def slew_of(options: Namespace) -> float:

@@ -114,6 +114,7 @@ class Step:
     finding: str = ""
     errors: Mapping[str, TrackingError] | None = None  # of a verification
     missing: tuple[Finding, ...] = ()  # samples that its record lacks
+    extended: frozenset[str] = frozenset()  # axes whose model, in a verification, has effects
 
 
 @dataclass(frozen=True)
@@ -258,9 +259,11 @@ class _Calibration:
         why: str,
         finding: str,
         errors: Mapping[str, TrackingError] | None = None,
+        extended: frozenset[str] = frozenset(),
     ) -> None:
         """Note the step of a drive."""
-        self._steps.append(Step(record.source, float(drive.t[-1]), why, finding, errors, missing_samples(record)))
+        missing = missing_samples(record)
+        self._steps.append(Step(record.source, float(drive.t[-1]), why, finding, errors, missing, extended))
 
     def _recorded(
         self,
@@ -366,7 +369,8 @@ class _Calibration:
         )
         model = model.shifted(moved)
         self._records.append(recording.record)
-        self._did(recording.record, drive, drive.why, finding, errors)
+        extended = frozenset(name for name, axis in model.axes.items() if axis.effects)
+        self._did(recording.record, drive, drive.why, finding, errors, extended)
         self._verified.append((model, errors))
         return errors
 
@@ -392,8 +396,7 @@ class _Calibration:
             recording = self._recorded(LOOP_DRIVE, drive, desired, loops_of(found, model))
             for name, one in shown.items():
                 error = tracking_error(recording, name, model, settings.goal(self._repeatability[name]))
-                t = without_held(recording.record, name)[0].t
-                rate = (t.size - 1) / (t[-1] - t[0])
+                rate = reading_rate(recording.record, name)
                 assert one.design
                 if too_slow(diagnosed.axis(name), one.design.gains, 1.0 / rate):
                     told = f"{one.told}; not shown on the stage: {rate:.3g} readings a second are too few for it"
@@ -401,8 +404,8 @@ class _Calibration:
                     continue
                 steps = step_answers(error.t, error.desired, error.error, model.axis(name).quality.floor_rms)
                 raster = error.part(moving(error.desired)).told()
-                off = f"; feedback was switched off: {recording.off}" if recording.off else ""
-                told = f"{one.told}; on the stage a raster of {RASTER:.0%} of the stroke has a {raster}{off}"
+                on_stage = f"on the stage a raster of {RASTER:.0%} of the stroke has a {raster}"
+                told = "; ".join(filter(None, (one.told, on_stage, switched_off(recording))))
                 found[name] = replace(one, told=told, steps=steps)
             self._records.append(recording.record)
         finding = "; ".join(f"axis {name}: {one.told}" for name, one in found.items())
@@ -412,6 +415,21 @@ class _Calibration:
         else:
             self._steps.append(Step("tune", 0.0, why, finding))
         return found
+
+
+def switched_off(recording: Recording) -> str:
+    """Return what is told of feedback that was switched off during a recording, "" if it was not."""
+    if recording.kept:
+        # Its bag holds what was sent and measured, and no reason.
+        return "whether feedback was switched off is not known of a kept record"
+    return f"feedback was switched off: {recording.off}" if recording.off else ""
+
+
+def reading_rate(record: Record, axis: str) -> float:
+    """Return the mean number of fresh readings of an axis per second."""
+    fresh = without_held(record, axis)[0]
+    t = fresh.t[np.isfinite(fresh.displacement[axis])]
+    return float((t.size - 1) / (t[-1] - t[0]))
 
 
 def _diagnosed(records: Sequence[Record], model: StageModel) -> Diagnosis:

@@ -39,7 +39,7 @@ def add_options(command: ArgumentParser) -> None:
     common.add_output(command, "NEXT.csv", "the next pass: columns time_s, <axis>_m")
     common.add_topics(command)
     common.add_accept_stage(command)
-    common.add_axes(command, help="default: every axis that bags and model share")
+    common.add_axes(command, help="default: those of --learned, else every axis that bags and model share")
     common.add_span(command, "the passes")
 
 

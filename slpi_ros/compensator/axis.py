@@ -89,6 +89,12 @@ class Axis:
         """Displacement (m) of the model for the feedforward voltage."""
         return self.stream.uncoupled_displacement + self.stream.coupled
 
+    @property
+    def aim(self) -> float:
+        """The last setpoint (m); where the axis is, without one or with a model that does not accept it."""
+        desired, (low, high) = self.tracking.desired, self.stream.accepted
+        return self.setpoint if desired is None or not low <= desired <= high else desired
+
     def saved(self, now_ns: int) -> SavedAxis:
         """Return what is to be kept over a restart."""
         relaxing = self.loop.applied(self.stream).relaxing(max((now_ns - self.samples.given_ns) * 1e-9, 0.0))
@@ -162,6 +168,12 @@ class Axis:
             self.stream.pace.change(allowed, period)
         self.output.change(allowed, period)
         self.motion.wake()
+
+    def use_checked(self, checked: bool) -> None:
+        """Take whether what comes next is a path that is known to keep the mean rate, and so is not slowed for it."""
+        self.output.checked = checked
+        if self.model:
+            self.stream.pace.checked = checked
 
     def check_loop(self, settings: LoopSettings, period: float) -> None:
         """Raise UsageError if other feedback settings or another output period (s) make the model's loop unstable."""
@@ -284,7 +296,7 @@ class Axis:
                 self.motion.step(self, now_ns)
         desired = self.tracking.desired
         if self.loop.active and self.motion.follows and self.loop.due_ns <= now_ns and desired is not None:
-            v = self.loop.tick(desired, self.stream.voltage, self.stream.coupled, now_ns)
+            v = self.loop.tick(self.aim, self.stream.voltage, self.stream.coupled, now_ns)
             self.amplifier.output(v, now_ns)
         return self.voltage != before or (moving and self.output.rate != rate)
 
@@ -309,15 +321,8 @@ class Axis:
         return v
 
     def hold(self, now_ns: int) -> None:
-        """Output the voltage that holds the last desired displacement now."""
-        assert self.tracking.desired is not None
-        self._sample(self.samples.step(now_ns), self.tracking.desired, now_ns)
-
-    def approach(self, now_ns: int) -> None:
-        """Go on towards the last setpoint, as fast as the limits allow."""
-        desired, (low, high) = self.tracking.desired, self.stream.accepted
-        y = self.setpoint if desired is None or not low <= desired <= high else desired
-        self._sample(self.samples.step(now_ns), y, now_ns)
+        """Output the voltage for `aim` now, as far as the limits allow."""
+        self._sample(self.samples.step(now_ns), self.aim, now_ns)
 
     def drive(self, voltage: float, now_ns: int) -> None:
         """Let memory and effects follow a voltage (V) of a motion without setpoints, which `output` has made."""
@@ -329,16 +334,23 @@ class Axis:
 
     def play(self, voltages: Sequence[float], period: float, now_ns: int) -> None:
         """Let memory and effects follow voltages (V) that a device has played, `period` (s) apart."""
+        self.output.play(voltages, period, now_ns)
         for v in voltages:
             self.stream.drive(v, period)
             self.loop.follow(v, period, now_ns)
-        if voltages:
-            self.output.start(voltages[-1])
         self.samples.given_ns = now_ns
 
     def _sample(self, dt: float, y: float, now_ns: int, early: bool = False) -> float:
         """Output and return the voltage (V) for the desired displacement `y` (m), `dt` (s) after the last step."""
-        v = self._output(dt, y, self.stream.move(dt, y, now_ns), now_ns)
+        stream = self.stream
+        v = stream.move(dt, y, now_ns)
+        if self.loop.follows_total:
+            v = self.loop.correct(dt, y, v, stream.coupled, now_ns)
+        self.held = self.slewing = False
+        if stream.missed:
+            self.held = stream.held
+            self.slewing = not self.held
+        self.amplifier.output(v, now_ns)
         self.initial.assumed = None
         self.loop.offsets.leave_reset()
         if self.loop.follows_total:
@@ -348,22 +360,13 @@ class Axis:
             self.uncertainty.sample(dt, y, v)
         return v
 
-    def _output(self, dt: float, y: float, v: float, now_ns: int) -> float:
-        """Output and return the voltage (V) for the setpoint `y` (m) with feedforward `v` (V)."""
-        stream = self.stream
-        if self.loop.follows_total:
-            v = self.loop.correct(dt, y, v, stream.coupled, now_ns)
-        self.held = self.slewing = False
-        if stream.missed:
-            self.held = stream.held
-            self.slewing = not self.held
-        self.amplifier.output(v, now_ns)
-        return v
-
     # Readings
 
-    def measure(self, displacement: float, now_ns: int, fresh: bool = True) -> None:
-        """Take a reading (m), `fresh`: stamped now; RejectedError if it is implausible."""
+    def measure(self, displacement: float, now_ns: int, fresh: bool = True, age: float = 0.0) -> None:
+        """Take a reading (m) of an `age` (s), `fresh`: stamped now; RejectedError if it is implausible.
+
+        What is older than the timeout of the feedback is no reading: to model and feedback the sensor is silent.
+        """
         if self.model is None:
             return
         low, high = self.stream.accepted
@@ -373,6 +376,9 @@ class Axis:
         if self.initial.assumed:
             if fresh:
                 self.initial.read(x, now_ns)
+            return
+        if age > self.loop.settings.timeout:
+            self.loop.sensor.stale = age
             return
         if not self.loop.follows_total:
             self.loop.close(self.stream, self.samples.given_ns)

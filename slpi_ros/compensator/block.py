@@ -15,7 +15,7 @@ from slpi_ros.compensator.trajectory import Trajectory
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.io.messages import SECOND_NS
 from slpi_ros.model.limits import Limits, RateLimiter
-from slpi_ros.model.mean_rate import WINDOW, highest_mean_rate, slower_by
+from slpi_ros.model.mean_rate import WINDOW, highest_mean_rate, later_by, slower_by
 from slpi_ros.model.streaming import StageStream
 
 # Most samples of a block: their voltages take some seconds to compute.
@@ -51,9 +51,12 @@ def sampling_period(times_ns: IntArray, period: float) -> float:
     return min(period, int(np.diff(times_ns).min()) * 1e-9) if times_ns.size > 1 else period
 
 
-def plan(path: Trajectory, axes: Sequence[Axis], stage: StageStream | None, period: float, stamp_ns: int) -> Block:
-    """Return the block of voltages for a path; RejectedError if it is too long. The axes, in a block, stay as they are.
+def plan(
+    path: Trajectory, axes: Sequence[Axis], stage: StageStream | None, period: float, stamp_ns: int, now_ns: int
+) -> Block:
+    """Return the block of voltages for a path from now on; RejectedError if it is too long, or its mean rate too high.
 
+    The axes, in a block, stay as they are.
     The samples are as far apart as the points where these are closer than `period` (s). First the limits let each axis
     go to the beginning of the path; the time of the path starts there.
     """
@@ -78,8 +81,8 @@ def plan(path: Trajectory, axes: Sequence[Axis], stage: StageStream | None, peri
         """Add the voltages for displacements (m); return whether the slew limit holds them back."""
         if stage:
             stage.decouple(dict(zip(names, row, strict=True)))
-        now_ns = len(rows) * step_ns
-        rows.append([axis.stream.move(period, y, now_ns) for axis, y in zip(moved, row, strict=True)])
+        at_ns = len(rows) * step_ns
+        rows.append([axis.stream.move(period, y, at_ns) for axis, y in zip(moved, row, strict=True)])
         return any(axis.stream.missed and not axis.stream.held for axis in moved)
 
     with _tried(moved, period):
@@ -101,27 +104,42 @@ def plan(path: Trajectory, axes: Sequence[Axis], stage: StageStream | None, peri
             behind = step(listed[-1])
     voltages = np.array(rows)
     for axis, v in zip(moved, voltages.T, strict=True):
-        _require_mean_rate(axis.name, np.arange(v.size) * period, v, axis.output.limits.mean_rate)
+        _require_mean_rate(axis, np.arange(v.size) * period, v, now_ns)
     return Block(stamp_ns, names, period, voltages, lead_in, missed)
 
 
-def require_mean_rates(path: Trajectory, axes: Sequence[Axis]) -> None:
-    """Reject a path whose voltages have too high a mean rate, as the models of its axes tell."""
+def require_mean_rates(path: Trajectory, axes: Sequence[Axis], now_ns: int, clock_ns: int) -> None:
+    """Reject a path whose voltages have too high a mean rate, as the models of its axes tell.
+
+    `clock_ns` is now on the clock of its start.
+    """
     t: FloatArray = path.time_from_start_ns.astype(np.float64) * 1e-9
+    if path.start_ns:
+        t += (path.start_ns - clock_ns) * 1e-9
     for axis in axes:
         if axis.name in path.names and axis.model and axis.output.limits.mean_rate < inf:
             within = Limits(axis.stream.limits.lower, axis.stream.limits.upper)
             v, _ = axis.model.compensate(t, path.positions[:, path.names.index(axis.name)], within)
-            _require_mean_rate(axis.name, t, v, axis.output.limits.mean_rate)
+            _require_mean_rate(axis, t, v, now_ns)
 
 
-def _require_mean_rate(axis: str, t: FloatArray, v: FloatArray, limit: float) -> None:
-    """Reject voltages (V, (N,)) at times (s, (N,)) whose mean rate exceeds a limit (V/s)."""
-    if limit < inf and (slower := slower_by(t, v, limit)) > 1.0:
+def _require_mean_rate(axis: Axis, t: FloatArray, v: FloatArray, now_ns: int) -> None:
+    """Reject voltages (V, (N,)) at times (s, (N,), now is 0) of too high a mean rate, alone or after the last ones."""
+    limit = axis.output.limits.mean_rate
+    if limit == inf:
+        return
+    if (slower := slower_by(t, v, limit)) > 1.0:
         raise RejectedError(
             rejection.OUT_OF_RANGE,
-            f"axis '{axis}': a mean rate of {highest_mean_rate(t, v):.4g} V/s over {WINDOW:g} s, mean_rate_limit is "
-            f"{limit:g} V/s; send it {slower:.3g} times more slowly",
+            f"axis '{axis.name}': a mean rate of {highest_mean_rate(t, v):.4g} V/s over {WINDOW:g} s, mean_rate_limit "
+            f"is {limit:g} V/s; send it {slower:.3g} times more slowly",
+        )
+    travelled, coming = axis.output.travelled, t >= 0.0
+    if (later := later_by(travelled, now_ns, t[coming], v[coming], limit)) > 0.0:
+        raise RejectedError(
+            rejection.OUT_OF_RANGE,
+            f"axis '{axis.name}': with the {travelled.within(now_ns):.4g} V of the last {WINDOW:g} s its mean rate "
+            f"exceeds mean_rate_limit, {limit:g} V/s; send it {later:.3g} s later",
         )
 
 

@@ -27,7 +27,7 @@ from slpi_ros.compensator.motion import (
 )
 from slpi_ros.compensator.motion import Block as BlockMotion
 from slpi_ros.compensator.ownership import Ownership
-from slpi_ros.compensator.persistence import RESETTING, SENSOR, MemoryConfidence, SavedAxis, Zero
+from slpi_ros.compensator.persistence import RESETTING, SENSOR, MemoryConfidence, SavedAxis, Zero, model_id
 from slpi_ros.compensator.reporters import WhoseStage
 from slpi_ros.compensator.statistics import Counts
 from slpi_ros.compensator.surroundings import Surroundings
@@ -64,7 +64,7 @@ class OperatingMode(Enum):
 class StopReason(Enum):
     """Why all motion was ended."""
 
-    CANCELED = "canceled"  # by an empty trajectory, or as its times are no longer valid
+    CANCELED = "canceled"  # by an empty trajectory, by a model that does not accept it, or as its times are not valid
     SILENCE = "no command"
     ZERO = "zero set"
     DEACTIVATED = "deactivated"
@@ -114,6 +114,7 @@ class Controller:
         self.block: BlockFollower | None = None  # the last one
         self.stopped: StopReason | None = None  # why all motion was ended last
         self._lifecycle = OperatingMode.UNCONFIGURED
+        self._discarded: StageModel | None = None  # the last one in use before `cleanup`, as it was identified
         self._stage: StageStream | None = None
         # Offset of the trajectory clock from the monotonic clock at the last call, nanoseconds.
         self._clock_ahead_ns = 0
@@ -182,6 +183,7 @@ class Controller:
 
     def cleanup(self) -> None:
         """Discard the model; the voltages are unchanged."""
+        self._discarded = self.identified or self._discarded
         self._lifecycle, self.model, self.identified = OperatingMode.UNCONFIGURED, None, None
         self.ownership.stage.model = ""
 
@@ -216,7 +218,10 @@ class Controller:
         if self.mode is OperatingMode.BLOCK:
             self._require(Kind.STREAM, 0)
         turns, identified = {name: each.reversal_voltages for name, each in (saved or {}).items()}, model
-        model = model.shifted({name: each.zero.offset for name, each in (saved or {}).items()})
+        zeros = {name: each.zero for name, each in (saved or {}).items()}
+        if not saved and self._discarded and model_id(self._discarded) == model_id(model):
+            zeros = {axis.name: axis.zero for axis in self.axes}
+        model = model.shifted({name: zero.offset for name, zero in zeros.items()})
         prepared = []
         for axis in self.axes:
             own = model.axis(axis.name)
@@ -233,12 +238,20 @@ class Controller:
                 axis.initial.assumed = None if saved else start_memory
             axis.use(own, stream)
             if saved:
-                axis.confidence, axis.zero = saved[axis.name].confidence(own.hysteresis_range), saved[axis.name].zero
+                axis.confidence = saved[axis.name].confidence(own.hysteresis_range)
             elif first and last_voltages and axis.name in last_voltages:
                 axis.locate(last_voltages[axis.name], 0)
+            axis.zero = zeros.get(axis.name, axis.zero)
+        self._discarded = None
         self.model, self.identified, stage.model = model, identified, model.hardware_id
         self._couple()
         self.surroundings.use(model)
+        if self.trajectory.recheck({axis.name: axis.stream.accepted for axis in self.axes}):
+            # As at its end: each axis holds its last setpoint, or stays where it is if that is not accepted either.
+            self.stopped = StopReason.CANCELED
+            for axis in self.axes:
+                axis.samples.restart()
+                axis.use_checked(False)
 
     def set_zero(self, now_ns: int) -> dict[str, float | None]:
         """Let the models agree with the sensors now; return by how much (m) each zero moves, None: not measured."""
@@ -363,14 +376,16 @@ class Controller:
         self.counts.note(aheads, self.messages.jump, held, slewing)
         return held
 
-    def measure(self, names: Sequence[str], displacements: Sequence[float], now_ns: int, fresh: bool = True) -> None:
-        """Store measured displacements (m), `fresh`: stamped now; a bad one is counted, raised after the others."""
+    def measure(
+        self, names: Sequence[str], displacements: Sequence[float], now_ns: int, fresh: bool = True, age: float = 0.0
+    ) -> None:
+        """Store displacements (m) measured `age` (s) ago, `fresh`: stamped now; a bad one is raised after others."""
         rejected: RejectedError | None = None
         for name, y in zip(names, displacements, strict=False):
             axis = self.messages.by_name.get(name)
             if axis:
                 try:
-                    axis.measure(y, now_ns, fresh)
+                    axis.measure(y, now_ns, fresh, age)
                 except RejectedError as error:
                     self.counts.reject(error, "measurements_rejected")
                     rejected = RejectedError(error.cause, f"axis '{name}': {error}")
@@ -426,7 +441,7 @@ class Controller:
             return
         try:
             path = self._path(Kind.TRAJECTORY, names, time_from_start_ns, positions, start_ns, now_ns)
-            require_mean_rates(path, self.axes)
+            require_mean_rates(path, self.axes, now_ns, clock_ns)
             delays = {axis.name: axis.model.chain.delay for axis in self.axes if axis.model}
             self.trajectory.start(path, clock_ns, delays, {axis.name: axis.stream for axis in self.axes})
         except RejectedError:
@@ -435,7 +450,7 @@ class Controller:
         self._clock_ahead_ns = clock_ns - now_ns
         self.watchdog.feed(now_ns)
         for axis in self.axes:
-            axis.output.checked = True
+            axis.use_checked(True)
 
     def follow_block(
         self,
@@ -456,7 +471,7 @@ class Controller:
             for axis in self.axes:
                 axis.begin(BlockMotion(), now_ns)
             try:
-                block = plan(path, self.axes, self._stage, self.trajectory.period, stamp_ns)
+                block = plan(path, self.axes, self._stage, self.trajectory.period, stamp_ns, now_ns)
             except RejectedError:
                 self._end_block(now_ns)
                 raise
@@ -512,7 +527,7 @@ class Controller:
         if not self.trajectory.on:
             for axis in self.axes:
                 axis.samples.restart()
-                axis.output.checked = False
+                axis.use_checked(False)
         return True
 
     # Motion without desired displacements
@@ -545,8 +560,7 @@ class Controller:
     def _tick(self, axes: Sequence[Axis], now_ns: int) -> bool:
         """Let each axis do what is due; return whether a voltage has changed."""
         if self._stage:
-            holding = {axis.name: axis.tracking.desired for axis in axes if axis.motion.kind is Kind.HOLD}
-            self._stage.decouple({name: y for name, y in holding.items() if y is not None})
+            self._stage.decouple({axis.name: axis.aim for axis in axes if axis.motion.kind is Kind.HOLD})
         moving = self.trajectory.moving if self.trajectory.on else ()
         new, resetting = False, any(axis.motion.kind is Kind.RESET for axis in axes)
         for axis in axes:
@@ -568,7 +582,7 @@ class Controller:
         if reason is not StopReason.SILENCE:
             self.watchdog.feed(now_ns)
         for axis in self.axes:
-            axis.output.checked = False
+            axis.use_checked(False)
             if reason is StopReason.LOST:
                 axis.begin(Idle() if self.ownership.armed else Fault(), now_ns)
                 continue

@@ -97,10 +97,7 @@ class Moved(Protocol):
         """Begin a motion that follows no setpoint."""
 
     def hold(self, now_ns: int) -> None:
-        """Output the voltage that holds the last desired displacement now."""
-
-    def approach(self, now_ns: int) -> None:
-        """Go on towards the voltage of the last setpoint."""
+        """Output the voltage for the last setpoint now, as far as the limits allow."""
 
     def drive(self, voltage: float, now_ns: int) -> None:
         """Let memory and effects follow a voltage (V)."""
@@ -158,7 +155,7 @@ class Approach(Motion):
 
     def step(self, axis: Moved, now_ns: int) -> None:
         """Go on towards that voltage."""
-        axis.approach(now_ns)
+        axis.hold(now_ns)
         follow(axis, now_ns, max(axis.samples.hold_ns, now_ns + axis.output.period_ns))
 
 

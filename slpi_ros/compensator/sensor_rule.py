@@ -84,6 +84,7 @@ class SensorRule(Rule):
     def __init__(self, span: float, noise: float = 0.0, limits: SensorLimits | None = None, axis: str = "") -> None:
         self.span, self.noise, self.axis = span, noise, axis
         self.fault_time = 0.0
+        self.stale = 0.0  # age (s) of readings that come too late to be used; 0: none has come since the last good one
         self.excused = False  # whether the readings tell of an oscillation, which another rule judges
         self._limits = limits or SensorLimits()
         self._readings = LatestRows(KEPT, 3)  # ns, expected (m), reading (m)
@@ -94,12 +95,13 @@ class SensorRule(Rule):
         """Start to watch: what was read before does not count, and readings are awaited from the next check on."""
         self._readings.clear()
         self._suspect.forget()
-        self._silence = None
+        self._silence, self.stale = None, 0.0
 
     def read(self, expected: float, reading: float, now_ns: int) -> None:
         """Take a reading (m), and the displacement of the model (m) at that time."""
         if self._silence:
             self._silence.hear(now_ns)
+        self.stale = 0.0
         self._readings.append(now_ns, expected, reading)
 
     def check(self, now_ns: int) -> Finding | None:
@@ -107,12 +109,16 @@ class SensorRule(Rule):
         if not self.fault_time:
             return None
         if self._silence is None:
-            self._silence = Silence(now_ns, lambda seconds: f"no measured_displacement for {seconds:.2g} s")
+            self._silence = Silence(now_ns, self._unheard)
         if reason := self._silence.beyond(self.fault_time, now_ns):
             return Finding("sensor", "silent", reason, self.axis)
         kind, reason = ("", "") if self.excused else self._look(now_ns)
         lasts = self._suspect.note(kind, now_ns, int(self._limits.lasts * self.fault_time * SECOND_NS))
         return Finding("sensor", kind, reason, self.axis) if lasts else None
+
+    def _unheard(self, seconds: float) -> str:
+        late = f"; what comes is stamped {self.stale:.2g} s ago, longer than measurement_timeout" if self.stale else ""
+        return f"no measured_displacement for {seconds:.2g} s{late}"
 
     def _look(self, now_ns: int) -> tuple[str, str]:
         """Return the kind and the reason of the fault that the readings of the last fault time show; "" if none."""

@@ -186,6 +186,7 @@ class TrajectoryExecutor:
         self.skipped = 0  # points, because a later one was already due
         self.crowded = 0  # of these, closer together than the output period
         self.too_fast = ""  # the first point that the slew limit will make late; "" if none is known
+        self.refused = ""  # why another model canceled the last one; "" if none did
         self._tracks: list[_Track] = []
         self._ahead: Iterator[str] = iter(())  # see `_look_ahead`
 
@@ -241,13 +242,29 @@ class TrajectoryExecutor:
             track.stop = track.until(begin_ns) if track.next_ns < begin_ns else track.next
         self._tracks = [*(track for track in kept if track.next < track.stop), *tracks]
         wait = (trajectory.start_ns - now_ns) * 1e-9 if trajectory.start_ns else 0.0
-        self.too_fast = ""
+        self.too_fast = self.refused = ""
         self._ahead = _look_ahead(trajectory, streams, wait, self.period) if streams else iter(())
         self.look_ahead()
 
     def look_ahead(self) -> None:
         """Look at the next points: whether the slew limit will make one late (`too_fast`)."""
         self.too_fast = self.too_fast or next(self._ahead, "")
+
+    def recheck(self, accepted: Mapping[str, tuple[float, float]]) -> bool:
+        """Cancel all if what is pending leaves the range (m) that another model accepts of an axis; return whether."""
+        for track in self._tracks:
+            # The way to the next point begins at the last sample.
+            rows = track.positions[track.next : track.stop]
+            rows = rows if track.since is None else np.vstack((track.since, rows))
+            for name, y in zip(track.names, rows.T, strict=True):
+                low, high = accepted[name]
+                beyond = y[(y < low) | (y > high)]
+                if beyond.size:
+                    self.cancel()
+                    why = refusal(float(beyond[0]), accepted[name])
+                    self.refused = f"trajectory canceled by another model: axis '{name}': {why}"
+                    return True
+        return False
 
     def cancel(self) -> None:
         """Discard all pending points."""

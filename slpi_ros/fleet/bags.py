@@ -4,6 +4,7 @@
 
 import hashlib
 import json
+import os
 import time
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
@@ -253,7 +254,7 @@ def given_up(one: Examined, reason: str) -> Judged:
 
 def _file_name(one: Examined) -> str:
     """Return a name for the files of a bag, unique by its date and path."""
-    return f"{plain_name(one.stage)}/{one.date_ns}-{hashlib.sha256(one.bag.path.encode()).hexdigest()[:8]}"
+    return f"{plain_name(one.stage)}/{one.date_ns}-{hashlib.sha256(os.fsencode(one.bag.path)).hexdigest()[:8]}"
 
 
 def model_name(one: Examined) -> str:

@@ -187,6 +187,15 @@ def as_table(rows: Sequence[Row]) -> "pa.Table":
         values = [getattr(row, item.name) for row in rows]
         if item.name == "causes":
             values = [[dict(cause) for cause in causes] for causes in values]
+        elif item.name == "findings":
+            values = [[_utf8(finding) for finding in findings] for findings in values]
+        elif kind == text:
+            values = [_utf8(value) for value in values]
         columns.append(pa.array(values, kind))
         schema.append(pa.field(item.name.removesuffix("_ns"), kind))
     return pa.table(columns, schema=pa.schema(schema, {"schema": SCHEMA}))
+
+
+def _utf8(text: str) -> str:
+    """Return a text that a column can hold: bytes of the name of a file that are not UTF-8 are escaped."""
+    return text.encode(errors="backslashreplace").decode()

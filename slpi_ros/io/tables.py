@@ -238,15 +238,13 @@ def read_table_with(
     path: str | os.PathLike[str], suffix: str, beside: Sequence[str]
 ) -> tuple[FloatArray, dict[str, FloatArray], dict[str, FloatArray]]:
     """Read times (s), finite values (V or m) by axis, and quantities by name, (N,) each, from a table of a command."""
-    # The columns are ``time_s``, ``<axis>_<suffix>``, "V" or "m", else in another unit of the same quantity, as in
-    # x_um, and of `beside` those that are there, in any order; others are ignored. A quantity is held where its cells
-    # are empty.
+    # The columns are ``time_s``, ``<axis>_<suffix>``, "V" or "m", of an axis without one that in another unit of the
+    # same quantity, as in x_um, and of `beside` those that are there, in any order; others are ignored. A quantity is
+    # held where its cells are empty.
     table = load_table(Path(path))
     ending = _ending(suffix)
     own = [name for name in table.columns if name not in beside]
-    columns, scale = {n.removesuffix(ending): n for n in own if n.endswith(ending) and n != ending}, 1.0
-    if not columns:
-        columns, scale = _in_another_unit(own, VOLTAGE if suffix == VOLTAGE.default else DISPLACEMENT)
+    columns = _of_each_axis(own, VOLTAGE if suffix == VOLTAGE.default else DISPLACEMENT)
     if not columns:
         raise RecordError(
             f"{path}: no column <axis>{ending}; there is {table.listing()}; write such names above the columns, or "
@@ -256,7 +254,7 @@ def read_table_with(
         raise RecordError(f"{path}: {len(columns)} columns <axis>{ending}, more than {MOST_AXES} axes; leave some out")
     time = match_column("time_s", table.columns)
     also = [name for name in beside if name in table.columns]
-    values = table.read((time, *columns.values(), *also))
+    values = table.read((time, *(name for name, _ in columns.values()), *also))
     for name in also:
         values[name] = _held(values[name])
     for column, samples in values.items():
@@ -267,17 +265,20 @@ def read_table_with(
             "no finite number (an empty cell counts as nan); write one into every cell",
         )
     _require_order(values[time], time, table)
-    by_axis = {axis: scale * values[column] for axis, column in columns.items()}
+    by_axis = {axis: scale * values[column] for axis, (column, scale) in columns.items()}
     return values[time], by_axis, {name: values[name] for name in also}
 
 
-def _in_another_unit(names: Sequence[str], quantity: ColumnQuantity) -> tuple[dict[str, str], float]:
-    """Return the columns ``<axis>_<unit>`` of the first unit of which there are any, by axis, and its SI value."""
-    parts = [(name, *name.rpartition("_")) for name in names]
-    for unit, scale in quantity.units.items():
-        if found := {axis: name for name, axis, _, end in parts if axis and quantity.unit(end) == unit}:
-            return found, scale
-    return {}, 1.0
+def _of_each_axis(names: Sequence[str], quantity: ColumnQuantity) -> dict[str, tuple[str, float]]:
+    """Return the column ``<axis>_<unit>`` of each axis, that in SI before others, and the SI value of its unit."""
+    units, found = list(quantity.units), dict[str, tuple[tuple[int, bool], str]]()
+    for name in names:
+        axis, _, end = name.rpartition("_")
+        if axis and (unit := quantity.unit(end)):
+            rank = units.index(unit), end != unit
+            if axis not in found or rank < found[axis][0]:
+                found[axis] = rank, name
+    return {axis: (name, quantity.units[units[rank[0]]]) for axis, (rank, name) in found.items()}
 
 
 def _held(values: FloatArray) -> FloatArray:

@@ -95,6 +95,12 @@ class PassReport:
         return {name: None if value != value else value for name, value in asdict(self).items()}
 
 
+def usual_limit(axis: AxisModel) -> float:
+    """Return the most (m) that learning may add to the desired path of an axis, unless another limit is given."""
+    low, high = axis.displacement_range
+    return LIMIT_SHARE * (high - low)
+
+
 @dataclass(frozen=True)
 class _Best:
     number: int
@@ -110,8 +116,7 @@ class AxisLearner:
         self, axis: AxisModel, dt: float, desired: FloatArray, limit: float | None, voltage: tuple[float, float]
     ) -> None:
         self.axis, self.dt, self.desired, self.voltage = axis, dt, desired, voltage
-        low, high = axis.displacement_range
-        self.limit = LIMIT_SHARE * (high - low) if limit is None else limit
+        self.limit = usual_limit(axis) if limit is None else limit
         self.spectrum = PathSpectrum(desired, dt)
         self.wanted, self.frequency = self.spectrum.of(desired), self.spectrum.frequency
         self.correction = np.zeros(desired.size)

@@ -39,6 +39,8 @@ class SampledPath:
     interval: float  # s
     whole: Mapping[str, FloatArray]  # m, (M,), by axis
     desired: Mapping[str, FloatArray]  # m, (N,), by axis that is learned: of one pass
+    t_given: FloatArray  # s, (P,), of the points that were given, from the first one on
+    given: Mapping[str, FloatArray]  # m, (P,), by axis: these points, which may be closer than the samples
     count: int = 1  # passes, one after the other
 
     @classmethod
@@ -58,21 +60,22 @@ class SampledPath:
         times, places = np.asarray(time_from_start_ns), np.asarray(positions, dtype=np.float64)
         start, own = float(times[0]) / SECOND_NS, (times - times[0]) / SECOND_NS
         duration = float(own[-1])
+        given = {name: places[:, column] for column, name in enumerate(names)}
         samples = min(round(learn_period / output_period), MOST_SAMPLES)
         if samples >= FEWEST:
             interval = round(learn_period / samples, 12)
             count = int((duration + interval) / learn_period + 1e-6)
-            whole = _sampled(names, own, places, interval, round(duration / interval))
+            whole = _sampled(given, own, interval, round(duration / interval))
             desired = {name: y[:samples] for name, y in whole.items() if _repeats(y, samples, count)}
             if desired:
                 identity = path_identity(_times(samples, interval), desired)
-                return cls(identity, start, interval, whole, desired, count)
+                return cls(identity, start, interval, whole, desired, own, given, count)
         steps = min(round(duration / output_period), MOST_SAMPLES - 1)
         if steps < FEWEST - 1:
             return None
         interval = round(duration / steps, 12)
-        whole = _sampled(names, own, places, interval, steps)
-        return cls(path_identity(_times(steps + 1, interval), whole), start, interval, whole, whole)
+        whole = _sampled(given, own, interval, steps)
+        return cls(path_identity(_times(steps + 1, interval), whole), start, interval, whole, whole, own, given)
 
     @property
     def t(self) -> FloatArray:
@@ -98,20 +101,19 @@ class SampledPath:
         t, added = self.t_whole, self.over_whole(correction)
         count = max(t.size - 1, round(float(t[-1]) / output_period))
         at = np.linspace(0.0, float(t[-1]), count + 1)
-        columns = [np.interp(at, t, y + added[name]) for name, y in self.whole.items()]
+        # Only the correction is at the samples: they may be further apart than the points of the path.
+        columns = [np.interp(at, self.t_given, y) + np.interp(at, t, added[name]) for name, y in self.given.items()]
         times = np.round((self.start + at) * SECOND_NS).astype(np.int64)
-        return list(self.whole), times, np.column_stack(columns)
+        return list(self.given), times, np.column_stack(columns)
 
 
 def _times(size: int, interval: float) -> FloatArray:
     return np.asarray(np.arange(size, dtype=np.float64) * interval)
 
 
-def _sampled(
-    names: Sequence[str], own: FloatArray, places: FloatArray, interval: float, steps: int
-) -> dict[str, FloatArray]:
+def _sampled(given: Mapping[str, FloatArray], own: FloatArray, interval: float, steps: int) -> dict[str, FloatArray]:
     t = _times(steps + 1, interval)
-    return {name: np.interp(t, own, places[:, column]) for column, name in enumerate(names)}
+    return {name: np.interp(t, own, y) for name, y in given.items()}
 
 
 def _repeats(y: FloatArray, samples: int, count: int) -> bool:
@@ -256,14 +258,23 @@ class RepeatedPaths:
                 return [f"what was learned cannot be kept: {error}"]
         return []
 
-    def forget(self) -> int:
-        """Begin anew from the desired paths, and remove the files; return how many paths were learned."""
-        files = kept_files(self.prefix)
-        count = max(len(self._learners), len(files))
+    def forget(self) -> tuple[int, str]:
+        """Begin anew from the desired paths, and remove the files.
+
+        Return how many paths were learned, and which file cannot be removed and why, "" if all are.
+        """
+        count, left = len(self._learners), ""
         self._learners.clear()
+        try:
+            files = kept_files(self.prefix)
+        except OSError as error:
+            return count, f"{self.prefix}: what was learned cannot be looked for: {error.strerror or error}"
         for file in files:
-            file.unlink(missing_ok=True)
-        return count
+            try:
+                file.unlink(missing_ok=True)
+            except OSError as error:
+                left = left or f"{file}: cannot be removed: {error.strerror or error}; remove it, or it comes back"
+        return max(count, len(files)), left
 
 
 def kept_files(prefix: str) -> list[Path]:

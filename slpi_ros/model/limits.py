@@ -65,15 +65,16 @@ class RateLimiter:
     # periods count: a late step is made up, a pause is not. With an acceleration limit every step leaves enough
     # distance to stop at the voltage limits and at the goal; a step after a pause starts from rest and counts one
     # output period. `voltage` (V) is the last output, or found at the amplifier, `rate` (V/s) that of the last step,
-    # `period` in seconds, `fastest` (V/s) what the slew limit and the mean rate allowed last. The slew limit
-    # falls before the mean rate is reached, but not of a path that is known to keep it (`checked`).
+    # `period` in seconds, `travelled` the way to the voltage, `fastest` (V/s) what the slew limit and the mean rate
+    # allowed last. The slew limit falls before the mean rate is reached, but not of a path that is known to keep it
+    # (`checked`).
     __slots__ = (
-        "_changed_ns", "_goal", "_limits", "_pending", "_travelled", "checked", "fastest", "period", "rate", "voltage",
+        "_changed_ns", "_goal", "_limits", "_pending", "checked", "fastest", "period", "rate", "travelled", "voltage",
     )  # fmt: skip
 
     def __init__(self, limits: Limits, period: float = PERIOD, voltage: float = 0.0) -> None:
         self._limits, self.period, self.fastest = limits, period, limits.slew
-        self._travelled, self.checked = Travelled(), False
+        self.travelled, self.checked = Travelled(), False
         self._pending: tuple[Limits, float] | None = None
         self.start(voltage)
 
@@ -130,9 +131,9 @@ class RateLimiter:
         lower, upper = limits.lower, limits.upper
         fastest = min(limits.slew, fastest)
         if limits.mean_rate < inf:
-            allowed = self._travelled.left(limits.mean_rate, now_ns) / (2.0 * self.period)
+            allowed = self.travelled.left(limits.mean_rate, now_ns) / (2.0 * self.period)
             if not self.checked:
-                allowed = min(allowed, self._travelled.fastest(limits.mean_rate, now_ns))
+                allowed = min(allowed, self.travelled.fastest(limits.mean_rate, now_ns))
             self.fastest = fastest = min(fastest, allowed)
         if limits.acceleration < inf:
             down, up = self._ways(now_ns, fastest)
@@ -175,6 +176,17 @@ class RateLimiter:
         """Slow down as fast as the acceleration limit allows; return the voltage (V) to output."""
         return self.move(self.voltage, now_ns)
 
+    def play(self, voltages: Sequence[float], period: float, now_ns: int) -> None:
+        """Continue at rest after voltages (V), `period` (s) apart, that a device has output by itself until now."""
+        if not voltages:
+            return
+        if self._limits.mean_rate < inf:
+            last = self.voltage
+            for ago, v in enumerate(voltages, 1 - len(voltages)):
+                self.travelled.move(abs(v - last), now_ns + round(ago * period * 1e9))
+                last = v
+        self.start(voltages[-1])
+
     def begin(self, now_ns: int) -> None:
         """Count the time of the next step from `now_ns` on, as if the voltage had just changed."""
         self._changed_ns = now_ns
@@ -182,7 +194,7 @@ class RateLimiter:
     def copy(self) -> "RateLimiter":
         """Return an independent copy."""
         other = copy(self)
-        other._travelled = self._travelled.copy()
+        other.travelled = self.travelled.copy()
         return other
 
     def _moved(self, v: float, now_ns: int, goal: float) -> None:
@@ -195,7 +207,7 @@ class RateLimiter:
             elif self._changed_ns is None or now_ns > self._changed_ns:
                 self._changed_ns = now_ns
             if self._limits.mean_rate < inf:
-                self._travelled.move(abs(v - self.voltage), now_ns)
+                self.travelled.move(abs(v - self.voltage), now_ns)
             self.voltage = v
         self._goal = goal
         if self._pending is not None and not self.in_motion:

@@ -17,6 +17,8 @@ WINDOW, PIECE_NS = 10.0, 20_000_000
 FREE_PIECES = 50
 # Bisections for a factor.
 HALVINGS = 40
+# Relative rounding error of a sum of ways.
+ROUNDING = 1e-9
 
 
 class Travelled:
@@ -31,8 +33,9 @@ class Travelled:
     def move(self, way: float, now_ns: int) -> None:
         """Count a way (V)."""
         number = now_ns // PIECE_NS
-        if self._pieces and self._pieces[-1][0] == number:
-            way_before = self._pieces.pop()[1]
+        if self._pieces and self._pieces[-1][0] >= number:
+            # What is told late is counted late.
+            number, way_before = self._pieces.pop()
             self._sum -= way_before
             way += way_before
         self._pieces.append((number, way))
@@ -57,6 +60,14 @@ class Travelled:
         # Rounding must not leave anything.
         self._sum = max(self._sum, 0.0) if self._pieces else 0.0
         return self._sum
+
+    def until(self, now_ns: int) -> tuple[FloatArray, FloatArray]:
+        """Return times (s, (N,), now is 0) within the window, and the way (V, (N,)) until each of them."""
+        self.within(now_ns)
+        pieces = np.array([number for number, _ in self._pieces], dtype=np.int64) * PIECE_NS - now_ns
+        times = np.minimum(np.stack([pieces, pieces + PIECE_NS], 1), 0).ravel() * 1e-9
+        ways = np.cumsum([0.0, *(way for _, way in self._pieces)])
+        return times, np.stack([ways[:-1], ways[1:]], 1).ravel()
 
     def copy(self) -> "Travelled":
         """Return an independent copy."""
@@ -87,6 +98,34 @@ def slower_by(t: FloatArray, v: FloatArray, limit: float) -> float:
     low, high = 1.0, 2.0
     while too_fast(high):
         low, high = high, 2.0 * high
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        low, high = (middle, high) if too_fast(middle) else (low, middle)
+    return high
+
+
+def later_by(before: Travelled, now_ns: int, t: FloatArray, v: FloatArray, limit: float) -> float:
+    """Return by how much later (s) voltages must begin for a mean rate (V/s) that holds the way before them, too.
+
+    Voltages (V, (N,)) at times (s, (N,)) from now on, that keep the mean rate by themselves.
+    """
+    times, ways = before.until(now_ns)
+    if not times.size or not t.size:
+        return 0.0
+    window = WINDOW + PIECE_NS * 1e-9
+    every = np.concatenate((ways, ways[-1] + np.concatenate(([0.0], np.cumsum(np.abs(np.diff(v)))))))
+
+    def too_fast(seconds: float) -> bool:
+        begin, later = t[0] + seconds, np.concatenate((times, t + seconds))
+        # The highest mean begins before the voltages, and ends among them: one of both at a sample.
+        ends = np.concatenate((t + seconds, times + window))
+        ends = ends[ends > begin]
+        most = np.max(np.interp(ends, later, every) - np.interp(ends - window, later, every), initial=0.0)
+        return bool(most > limit * WINDOW * (1.0 + ROUNDING))
+
+    if not too_fast(0.0):
+        return 0.0
+    low, high = 0.0, window
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if too_fast(middle) else (low, middle)

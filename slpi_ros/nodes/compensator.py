@@ -58,6 +58,8 @@ REPORT_NS = SECOND_NS // 200
 LOOK_NS = SECOND_NS // 2
 # Polling period while publishers of stage_state are discovered, seconds.
 DISCOVERY_POLL = 0.005
+# Shortest time between two log messages about measurements that come too late, seconds.
+LATE_LOG_PERIOD = 60.0
 # Desired messages that are answered at once if they wait.
 BACKLOG = 200
 
@@ -296,9 +298,20 @@ class Compensator(LifecycleNode):
         if self._learning.passes.on and fresh:
             self._learning.passes.read(names, displacements, self._paths.clocks()[1] - age_ns)
         try:
-            self._controller.measure(names, displacements, time.monotonic_ns(), fresh)
+            self._controller.measure(names, displacements, time.monotonic_ns(), fresh, age_ns * 1e-9)
         except RejectedError as error:
             self._reporter.reject(error)
+
+    def _remark_late(self) -> None:
+        """Log of which axes the measurements come too late to be used."""
+        late = [axis for axis in self._controller.axes if axis.loop.sensor.stale]
+        if late:
+            said = ", ".join(f"axis '{axis.name}' {axis.loop.sensor.stale:.2g} s" for axis in late)
+            self.get_logger().warning(
+                f"measured_displacement is older than measurement_timeout and not used: {said}; check delays and "
+                "clocks, or set measurement_timeout",
+                throttle_duration_sec=LATE_LOG_PERIOD,
+            )
 
     def _report_held(self) -> None:
         self._reporter.note_out_of_reach()
@@ -438,6 +451,8 @@ class Compensator(LifecycleNode):
             if all(axis.model for axis in controller.axes):
                 reporter.log.remark("stage", controller.ownership.stage.doubt)
         self._locate()
+        self._remark_late()
+        reporter.log.remark("refused path", controller.trajectory.refused)
         for axis in controller.axes:
             found = axis.amplifier.calibration
             if found != Calibration():

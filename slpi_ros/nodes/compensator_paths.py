@@ -128,6 +128,7 @@ class Paths:
         return ""
 
     def on_forgotten(self, count: int) -> None:
-        """Answer that what was learned of so many paths is forgotten."""
-        self._forget_service.answer(True, f"forgotten: {count} {'path' if count == 1 else 'paths'}")
+        """Answer whether what was learned of so many paths is forgotten."""
+        left = self._learning.not_forgotten
+        self._forget_service.answer(not left, left or f"forgotten: {count} {'path' if count == 1 else 'paths'}")
         self._reporter.report()

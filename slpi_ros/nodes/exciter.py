@@ -26,6 +26,8 @@ from slpi_ros.nodes.guarded_drive import GuardedDrive
 from slpi_ros.nodes.parameters import Declaration, Parameters, Values, limits_of, validated
 
 LIVE = "live"
+# What a drive takes when it begins: what moves the stage is limited by it.
+BEGUN_WITH = ("voltage_min", "voltage_max", "slew_limit", "mean_rate_limit", "rate")
 # Where a driver tells what becomes of a block.
 BLOCK_STATE = "voltage_trajectory_state"
 
@@ -84,6 +86,14 @@ class ExciterSettings:
         self._require_mean_rate(drive)
         return drive
 
+    def require_as_begun(self, begun: "ExciterSettings") -> None:
+        """Raise UsageError if limits or rate differ from those with which a drive has begun."""
+        if changed := [name for name in BEGUN_WITH if self.values[name] != begun.values[name]]:
+            raise UsageError(
+                f"parameter {', '.join(changed)}: a drive waits or is on its way, and keeps the limits and the rate "
+                "that it began with; call ~/stop first"
+            )
+
     def _require_mean_rate(self, drive: Drive) -> None:
         """Raise UsageError if the mean rate of an axis exceeds its limit."""
         again = 1 + math.ceil(WINDOW / drive.t[-1]) if self.values["repeat"] else 1
@@ -125,7 +135,6 @@ class Exciter(Node):
     def __init__(self) -> None:
         super().__init__("exciter")
         self._parameter_set = Parameters(self, DECLARATIONS, ExciterSettings.of)
-        self._parameter_set.follow(lambda settings: None)
         values = self._values
         self._playback: Playback | None = None
         self._block: BlockDrive | None = None  # of the playback, unless it is live
@@ -143,6 +152,7 @@ class Exciter(Node):
         self._rest: list[float] = []
         self._waiting = self._returning = self._arriving = self._leaving = self._ending = False
         self._begun = 0.0  # of waiting, of the excitation, of its end
+        self._parameter_set.follow(lambda settings: None, self._require_as_begun)
         steady_timer(self, WATCH_PERIOD, self._watch)
         if values["autostart"]:
             self._wait()
@@ -171,6 +181,10 @@ class Exciter(Node):
     @property
     def _values(self) -> Values:
         return self._parameter_set.settings.values
+
+    def _require_as_begun(self, settings: ExciterSettings) -> None:
+        if self._waiting or self._playback is not None:
+            settings.require_as_begun(self._parameter_set.settings)
 
     # Before the excitation
 

@@ -264,10 +264,11 @@ class Identify(Node):
         self._waiting: deque[Path] = deque()
         self._watch: BagWatch | None = None
         self._abandoned: tuple[Path, ...] = ()
-        self._stage: StageIdentity | None = None
+        self._stage: StageIdentity | None = None  # of the watched folder
+        self._as_in_use = True  # as long as the stage is not known it is that of the model in use
         self._failed = 0
         self._model = StageModel({})  # the last one that was published
-        self._doubtful: tuple[FitRequest, str] | None = None
+        self._doubtful: tuple[FitRequest, FitOutcome] | None = None
         self._error = ""
         steady_timer(self, POLL_PERIOD, self._poll_jobs)
         steady_timer(self, WATCH_PERIOD, self._poll_bags)
@@ -287,7 +288,7 @@ class Identify(Node):
         before, self._settings = self._settings, settings
         if settings.watch_directory != before.watch_directory:
             # Another folder may hold bags of another stage.
-            self._stage = None
+            self._stage, self._as_in_use = None, False
         if settings == before or replace(settings, diagnosis_directory=before.diagnosis_directory) != before:
             self._begin()
 
@@ -322,8 +323,8 @@ class Identify(Node):
     def _on_trigger(self) -> tuple[bool, str]:
         """Publish a withheld model, if any; else identify again from the given bags or from the newest watched bag."""
         if self._doubtful:
-            asked, document = self._doubtful
-            self._take(asked, FitOutcome(document))
+            asked, outcome = self._doubtful
+            self._take(asked, replace(outcome, doubt=""))
             return not self._error, self._error or shown(f"published the model of {asked.source}")
         try:
             self._begin()
@@ -342,7 +343,7 @@ class Identify(Node):
         request, self._asked = self._asked, None
         if not request and self._waiting:
             bag = str(self._waiting.popleft())
-            request = replace(self._settings.request, bags=(bag,), stage=self._stage)
+            request = replace(self._settings.request, bags=(bag,), stage=self._stage, as_in_use=self._as_in_use)
         return replace(request, in_use=self._in_use.document) if request else None
 
     def _end_job(self) -> None:
@@ -356,15 +357,16 @@ class Identify(Node):
         outcome = job.outcome() if job else None
         if job and outcome:
             self._job = None
-            if job.request.in_use == self._in_use.document or job.request.unconditional or outcome.error:
+            same, required = job.request.in_use == self._in_use.document, job.request.requires_stage_in_use
+            if same or (not required and (job.request.unconditional or outcome.error)):
                 self._take(job.request, outcome)
             else:
-                # Another model has come into use meanwhile: compare with that one.
+                # Another model has come into use meanwhile: its stage counts, and it is the one to compare with.
                 self._asked = job.request
             self._start_next()
 
     def _take(self, request: FitRequest, outcome: FitOutcome) -> None:
-        self._doubtful = (request, outcome.document) if outcome.doubt else None
+        self._doubtful = (request, outcome) if outcome.doubt else None
         if outcome.doubt:
             self._error = shown(
                 f"{outcome.doubt}; the model in use stays: call ~/identify to publish the new one nevertheless, or "
@@ -375,14 +377,19 @@ class Identify(Node):
             self._fail(outcome.error)
         else:
             self._error = ""
-            self._publish(request, outcome.document)
+            self._publish(request, outcome)
         self._report()
 
-    def _publish(self, request: FitRequest, document: str) -> None:
+    def _publish(self, request: FitRequest, outcome: FitOutcome) -> None:
         """Publish a model, write it to the file `output`, if any, and have it diagnosed from now on."""
-        self._model = parse_model(document, "identify")
-        self._stage = StageIdentity.of(self._model, request.stage)
-        self._diagnosis.use(DiagnosisRequest(request.bags, request.topic, document, surroundings=request.surroundings))
+        document, self._model = outcome.document, parse_model(outcome.document, "identify")
+        self._stage = StageIdentity.of(self._model, outcome.stage)
+        self._diagnosis.use(
+            DiagnosisRequest(
+                request.bags, request.topic, document,
+                surroundings=request.surroundings, start=request.start, stop=request.stop,
+            )
+        )  # fmt: skip
         try:
             if request.output:
                 allow_document(request.output, "model")

@@ -150,12 +150,18 @@ class FitRequest(BagsRequest):
     start: float | None  # s, of the fitted part; None: first stamp
     stop: float | None  # s; None: last stamp
     output: str  # file for the model document; "": none
-    stage: StageIdentity | None = None  # that the bags must belong to; None: any
-    in_use: str = ""  # model document to compare with; "": that in `output`, if any
+    stage: StageIdentity | None = None  # that the bags must belong to; None: any, unless `as_in_use`
+    as_in_use: bool = False  # without a `stage` the bags must belong to that of the model in use, if there is one
+    in_use: str = ""  # document of the model in use; "": that in `output`, if any
     unconditional: bool = False  # published whatever the comparison says
     sensor_delay: float = 0.0  # s, known
     sensor_lag: float = 0.0  # s, known
     surroundings: tuple[str, ...] = ()  # recorded quantities that the stage may follow
+
+    @property
+    def requires_stage_in_use(self) -> bool:
+        """Whether the bags must belong to the stage of the model in use, if there is one."""
+        return self.as_in_use and self.stage is None
 
 
 @dataclass(frozen=True)
@@ -165,6 +171,7 @@ class FitOutcome:
     document: str = ""
     error: str = ""
     doubt: str = ""  # why the model must not replace the one in use automatically
+    stage: StageIdentity | None = None  # that the bags had to belong to
 
 
 def fit(request: FitRequest) -> FitOutcome:
@@ -175,39 +182,46 @@ def fit(request: FitRequest) -> FitOutcome:
     from slpi_ros.workflows.identify import IdentifyRequest, identify
     from slpi_ros.workflows.records import Source
 
+    in_use = _in_use(request)
+    stage = StageIdentity.of(in_use) if in_use and request.requires_stage_in_use else request.stage
     try:
         sensor = Sensor(request.sensor_delay, request.sensor_lag)
         source = Source(
             request.bags, request.topic, start=request.start, stop=request.stop, surroundings=request.surroundings
         )
         records = source.read()
-        if request.stage:
+        if stage:
             for record in records:
-                request.stage.require(record)
+                stage.require(record)
         model = identify(IdentifyRequest(replace(source, records=records), request.kind, sensor=sensor)).model
         document, doubt = format_model(model), ""
-        in_use = None if request.unconditional else _in_use(request, records)
-        if in_use:
+        if in_use and not request.unconditional and _is_of(StageIdentity.of(in_use), records):
             doubt = doubt_about(model, in_use, records)
     except SlpiError as error:
         return FitOutcome(error=str(error))
-    return FitOutcome(document, doubt=doubt and f"{request.source}: {doubt}")
+    return FitOutcome(document, doubt=doubt and f"{request.source}: {doubt}", stage=stage)
 
 
-def _in_use(request: FitRequest, records: Sequence[Record]) -> StageModel | None:
-    """Return the model in use of the stage of these records; None if there is none, or none that can be read."""
+def _in_use(request: FitRequest) -> StageModel | None:
+    """Return the model in use; None if there is none, or none that can be read."""
     try:
         if request.in_use:
-            model = parse_model(request.in_use, "stage_model")
-        elif request.output and Path(request.output).is_file():
-            model = load_model(request.output)
-        else:
-            return None
-        for record in records:
-            StageIdentity.of(model).require(record)
+            return parse_model(request.in_use, "stage_model")
+        if request.output and Path(request.output).is_file():
+            return load_model(request.output)
     except SlpiError:
-        return None
-    return model
+        pass
+    return None
+
+
+def _is_of(stage: StageIdentity, records: Sequence[Record]) -> bool:
+    """Return whether all records may be of a stage."""
+    try:
+        for record in records:
+            stage.require(record)
+    except RecordError:
+        return False
+    return True
 
 
 @dataclass(frozen=True)
@@ -217,6 +231,8 @@ class DiagnosisRequest(BagsRequest):
     document: str
     folder: str = ""
     surroundings: tuple[str, ...] = ()  # recorded quantities that are looked at; empty: all
+    start: float | None = None  # s, of the fitted part; None: first stamp
+    stop: float | None = None  # s; None: last stamp
 
 
 @dataclass(frozen=True)
@@ -238,7 +254,8 @@ def run_diagnosis(request: DiagnosisRequest) -> DiagnosisOutcome:
     try:
         make_folder(folder, *FILES)
         model = parse_model(request.document, "stage_model")
-        source = Source(request.bags, request.topic, surroundings=request.surroundings or None)
+        quantities = request.surroundings or None
+        source = Source(request.bags, request.topic, start=request.start, stop=request.stop, surroundings=quantities)
         diagnosis = diagnose(DiagnoseRequest(source, model)).diagnosis
         write_files(folder, diagnosis)
     except SlpiError as error:

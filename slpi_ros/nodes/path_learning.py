@@ -9,14 +9,17 @@ from dataclasses import dataclass
 from multiprocessing.connection import Connection
 from typing import Any
 
+import numpy as np
 from numpy.typing import ArrayLike
 
+from slpi_ros.arrays import FloatArray
 from slpi_ros.compensator.block import Block, sampling_period
 from slpi_ros.compensator.controller import Controller, OperatingMode
 from slpi_ros.compensator.path_passes import ComingAgain, PassRecorder, PathPasses
 from slpi_ros.compensator.trajectory import Trajectory
 from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.io.stage_name import same_stage
+from slpi_ros.learning.axis_learner import usual_limit
 from slpi_ros.learning.repeated_paths import AxisProgress, Learned, RepeatedPaths, SampledPath
 from slpi_ros.model.document import format_model, parse_model
 from slpi_ros.model.stage_model import StageModel
@@ -31,11 +34,15 @@ MOST_WAITING = 4
 
 @dataclass(frozen=True)
 class Answer:
-    """What is known of paths; why the last pass that tells nothing does not; how many paths were forgotten, if so."""
+    """What is known of paths; why the last pass that tells nothing does not; how many paths were forgotten, if so.
+
+    `not_forgotten`: why what was forgotten will come back, with the file; "" if it will not.
+    """
 
     learned: Sequence[Learned] = ()
     dropped: str = ""
     forgotten: int | None = None
+    not_forgotten: str = ""
 
 
 class Paths:
@@ -57,7 +64,8 @@ class Paths:
     def forget(self, prefix: str) -> Answer:
         """Forget everything, and remove the files that begin with `prefix`."""
         self._paths.prefix, self._again = prefix, ComingAgain()
-        return Answer(forgotten=self._paths.forget())
+        forgotten, left = self._paths.forget()
+        return Answer(forgotten=forgotten, not_forgotten=left)
 
 
 def serve(connection: Connection) -> None:
@@ -74,7 +82,7 @@ class PathLearning:
     """Correct the trajectories of the controller by what was learned of them, and learn from their passes.
 
     `prefix` begins the names of the files that are kept; "": none. `on_forgotten` is called in the thread of `poll`
-    with the number of paths.
+    with the number of paths, also where a file could not be removed; `not_forgotten` then tells which one and why.
     """
 
     def __init__(self, controller: Controller, prefix: str, on_forgotten: Callable[[int], None]) -> None:
@@ -84,6 +92,7 @@ class PathLearning:
         self.progress: dict[str, AxisProgress] = {}  # of the path that came last, by axis
         self.dropped = ""  # why the last pass that tells nothing does not
         self.remarks: deque[str] = deque()  # to be logged
+        self.not_forgotten = ""  # why what was forgotten last will come back, with the file
         self._controller, self._prefix, self._on_forgotten = controller, prefix, on_forgotten
         self._model: StageModel | None = None
         self._opened = False
@@ -149,8 +158,26 @@ class PathLearning:
         if as_block:
             period = sampling_period(valid.time_from_start_ns, period)
         path = SampledPath.of(valid.names, valid.time_from_start_ns, valid.positions, period, self.period)
-        correction = self.passes.corrections.get(path.identity) if path else None
+        correction = self._within_limit(path.identity) if path else None
         return path, (path.corrected(correction, period) if path and correction else plain)
+
+    def _within_limit(self, identity: str) -> Mapping[str, FloatArray] | None:
+        """Return what was learned of a path, at most the present limit; its next pass follows the same."""
+        # The process may be busy for seconds with a request that came before a lower limit, or another model.
+        known = self.passes.corrections.get(identity)
+        if known is None:
+            return None
+        within = {name: np.clip(y, -self._most(name), self._most(name)) for name, y in known.items()}
+        self.passes.corrections[identity] = within
+        return within
+
+    def _most(self, name: str) -> float:
+        """Return the most (m) that may be added to the desired displacement of an axis now."""
+        most = self.limit.get(name) if self.limit else None
+        if most is None:
+            axis = self._model.axes.get(name) if self._model else None
+            most = usual_limit(axis) if axis else 0.0
+        return most
 
     def begin(self, path: SampledPath | None, start_ns: int, clock_ns: int) -> None:
         """Take notice of a trajectory that was accepted; None: it is not learned."""
@@ -168,7 +195,9 @@ class PathLearning:
             answer = coming.result()
             self.dropped = answer.dropped or self.dropped
             if answer.forgotten is not None:
-                self.dropped = ""
+                self.dropped, self.not_forgotten = "", answer.not_forgotten
+                if answer.not_forgotten:
+                    self.remarks.append(answer.not_forgotten)
                 self._on_forgotten(answer.forgotten)
                 if self.mode == OFF:
                     self._thread.submit(self._stop)
@@ -188,7 +217,7 @@ class PathLearning:
                 self._ask(lambda: (Paths.learn, done))
 
     def forget(self) -> None:
-        """Begin anew from the desired paths; `on_forgotten` is called when the files are removed."""
+        """Begin anew from the desired paths; `on_forgotten` is called when the files are removed, or cannot be."""
         self.passes.forget()
         self.progress = {}
         self._era += 1
@@ -200,7 +229,8 @@ class PathLearning:
         self._stop()
 
     def _stop(self) -> None:
-        worker = self._worker
+        # None: a request that follows at once must not be sent to a process that has not ended yet.
+        worker, self._worker = self._worker, None
         if worker:
             worker.process.kill()
 
@@ -209,8 +239,8 @@ class PathLearning:
 
     def _answer(self, request: Callable[[], tuple[Any, ...]]) -> Answer:
         """Send a request to the process, which is started if there is none; wait for its answer."""
+        wanted = request()
         try:
-            wanted = request()
             if self._worker is None or not self._worker.process.is_alive():
                 if wanted[0] is Paths.learn:
                     # A new process has to be given the model first.
@@ -220,7 +250,8 @@ class PathLearning:
             answer: Answer = self._worker.connection.recv()
         except (EOFError, OSError):
             self._worker, self._opened = None, False
-            return Answer(
-                [Learned("", {}, {}, ("the process that learns has ended: learning goes on from the files",))]
-            )
+            ended = "the process that learns has ended: learning goes on from the files"
+            if wanted[0] is Paths.forget:
+                return Answer(forgotten=0, not_forgotten=f"{ended}; call ~/forget again")
+            return Answer([Learned("", {}, {}, (ended,))])
         return answer

@@ -92,12 +92,12 @@ def _errors(outcome: Outcome) -> list[list[str]]:
         [
             step.name,
             axis,
-            "with the causes found" if number and outcome.diagnosis.axes[axis].effects else "hysteresis alone",
+            "with the causes found" if axis in step.extended else "hysteresis alone",
             length(error.mean),
             f"{error.mean / error.stroke:.3%}",
             *map(length, (error.maximum, error.offset, error.rest)),
         ]
-        for number, step in enumerate(step for step in outcome.steps if step.errors)
+        for step in outcome.steps
         for axis, error in (step.errors or {}).items()
     ]
 

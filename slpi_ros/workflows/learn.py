@@ -12,7 +12,7 @@ from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import RecordError, UsageError
 from slpi_ros.identification.held_readings import without_held
 from slpi_ros.io.desired import DesiredPath, at_times, read_desired
-from slpi_ros.io.record import Record
+from slpi_ros.io.record import Record, common_stage
 from slpi_ros.learning.axis_learner import MOST_REFUSED, PassReport
 from slpi_ros.learning.learner import FEWEST, Learner
 from slpi_ros.model.stage_model import StageModel
@@ -76,9 +76,12 @@ def learn(request: LearnRequest) -> LearnOutcome:
     bags = source.bags if not source.records else [""] * len(records)
     read = sorted(zip(bags, records, strict=True), key=lambda one: int(one[1].time_ns[0]))
     with mismatch_in_data():
-        axes = tuple(shared_axes(records, model, source))
+        common_stage(records, model.hardware_id)
+        axes = _axes(request, records)
         for axis in axes:
             model.axis(axis)
+            for record in records:
+                record.require_axis(axis)
     learner: Learner | None = None
     found: list[LearnedPass] = []
     remarks: list[str] = []
@@ -109,6 +112,30 @@ def learn(request: LearnRequest) -> LearnOutcome:
             "path, by --desired and --period if no desired displacements were recorded"
         )
     return LearnOutcome(learner, found, remarks)
+
+
+def _axes(request: LearnRequest, records: Sequence[Record]) -> tuple[str, ...]:
+    """Return the axes to learn; by default those of what was learned, else those that the model and all records hold.
+
+    RecordError if what was learned is of others than these.
+    """
+    axes = tuple(shared_axes(records, request.model, request.source))
+    if request.learned is None or request.desired is not None:
+        # A path that is given anew is compared with the learned one when that is gone on with.
+        return axes
+    learned = tuple(request.learned["axes"])
+    if missing := set(learned).difference(axes):
+        where = "chosen" if request.source.axes else "in all of the bags and the model"
+        raise RecordError(
+            f"{request.learned_file}: learned of axes {', '.join(learned)}, but '{min(missing)}' is not {where}; "
+            "choose these axes and give bags of them, or another file for what is learned"
+        )
+    if more := set(axes).difference(learned) if request.source.axes else ():
+        raise RecordError(
+            f"{request.learned_file}: learned of axes {', '.join(learned)}, not of '{min(more)}', which is chosen; "
+            "choose these axes, or another file for what is learned"
+        )
+    return learned
 
 
 def _passes(

@@ -15,6 +15,8 @@ from slpi_ros.calibration.run import (
     before_path,
     calibrate,
     moved_zeros,
+    reading_rate,
+    switched_off,
     tracking_error,
     why,
     with_present_zero,
@@ -223,6 +225,22 @@ def test_the_zero_of_a_verification_is_that_of_the_sweep_before_its_path():
     assert tracking_error(recording, "x", MODEL, 1e-8, moved).mean == pytest.approx(0.02e-6, abs=1e-12)
 
 
+def test_the_rate_of_readings_is_that_of_the_sensor_not_of_the_messages():
+    t = np.arange(4000) / RATE
+    v = 50.0 - 50.0 * np.cos(t)
+    y = MODEL.simulate(t, {"x": v})["x"] + np.random.default_rng(0).normal(0.0, 8e-9, t.size)
+    record = Record(np.round(t * 1e9).astype(np.int64), {"x": v}, {"x": y})
+    held = replace(record, displacement={"x": y[np.arange(t.size) // 5 * 5]})
+    assert reading_rate(record, "x") == pytest.approx(RATE)
+    assert reading_rate(held, "x") == pytest.approx(RATE / 5, rel=0.01)
+
+
+def test_why_feedback_was_switched_off_is_not_known_of_a_kept_record():
+    recording = Recording(Record(np.arange(2), {"x": np.zeros(2)}, {"x": np.zeros(2)}), {}, off="it oscillated")
+    assert switched_off(recording).endswith("it oscillated") and not switched_off(replace(recording, off=""))
+    assert "not known" in switched_off(replace(recording, kept=True, off=""))
+
+
 @pytest.mark.slow
 def test_a_hidden_cause_is_named_and_undone(tmp_path):
     recorder, steps = SimulatedRecorder(stage_of(Character(creep=0.015))), []
@@ -231,8 +249,10 @@ def test_a_hidden_cause_is_named_and_undone(tmp_path):
     assert [effect.name for effect in outcome.diagnosis.axes["x"].effects] == ["creep"]
     error = outcome.errors["x"]
     assert error.mean < 5e-4 * error.stroke
-    first = next(step.errors["x"] for step in outcome.steps if step.errors)
+    verified = [step for step in outcome.steps if step.errors]
+    first = verified[0].errors["x"]
     assert error.mean < 0.5 * first.mean
+    assert [step.extended for step in verified] == [frozenset(), frozenset({"x"})]
     # The compensator starts where the last drive has left the stage.
     last = recorder.recordings[-1].record
     assert outcome.model.axes["x"].end.voltage == pytest.approx(last.voltage["x"][-1], abs=0.01)

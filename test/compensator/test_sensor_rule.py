@@ -168,3 +168,38 @@ def test_feedback_that_is_switched_on_while_nobody_sends_awaits_its_sensor_from_
     assert not loop.made.watch(safety, FAULT_TIME, loop.now_ns)
     assert not loop.made.watch(safety, FAULT_TIME, loop.now_ns + 499 * MS)
     assert [found.kind for found in loop.made.watch(safety, FAULT_TIME, loop.now_ns + 500 * MS)] == ["silent"]
+
+
+def test_readings_that_come_too_late_are_none():
+    """They read 1 um above the model, by their stamps 0.3 s ago: nothing follows them, and the fault says so."""
+    model = axis_model(FAMILY_CASE)
+    made = Controller(["x"], [Limits(0.0, 100.0, 1000.0)], loops=[LoopSettings(True, PidGains(1e5, 1e8), 0.1)])
+    made.configure()
+    made.use_model(StageModel({"x": model}))
+    now, found = 10**9, []
+    made.activate(now)
+
+    def run(count, ages, off):
+        nonlocal now
+        for _ in range(count):
+            now += MS
+            made.update(now, ["x"], [10e-6], now)
+            for age in ages:
+                made.measure(["x"], [made.axes[0].expected + off], now, age <= 0.2, age)
+            found.extend(made.watch(Safety(0.0, False, False, (0.0,), 50.0), FAULT_TIME, now))
+
+    loop = made.axes[0].loop
+    run(200, [0.099], 0.0)
+    before = loop.correction
+    assert loop.state == "on" and loop.sensor.stale == 0.0
+    run(300, [0.3], 1e-6)
+    # It would be 30 V.
+    assert loop.correction == pytest.approx(before, abs=1e-3) and loop.state == "holding" and not found
+    assert loop.sensor.stale == 0.3
+    run(300, [0.3], 1e-6)
+    assert [each.kind for each in found] == ["silent"]
+    assert "no measured_displacement for 0.5 s" in found[0].reason
+    assert "stamped 0.3 s ago, longer than measurement_timeout" in found[0].reason
+    # Without a fault of the clock they count again.
+    run(1, [0.0], 0.0)
+    assert loop.sensor.stale == 0.0

@@ -10,15 +10,18 @@ from hypothesis import strategies as st
 from strategies import FAMILY_CASE, axis_model, axis_models, cases_and_paths, stream_forward
 
 from slpi_ros.compensator.axis import Axis
-from slpi_ros.compensator.controller import OPEN_LOOP
+from slpi_ros.compensator.controller import OPEN_LOOP, Controller, StopReason
+from slpi_ros.compensator.feedback import LoopSettings, PidGains
 from slpi_ros.compensator.model_swap import take_over, turning_voltages
+from slpi_ros.compensator.validation import RejectedError
 from slpi_ros.effects.creep import Creep
 from slpi_ros.effects.lag import Lag
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.hysteresis.shapes import FAR
 from slpi_ros.model.limits import Limits
+from slpi_ros.model.stage_model import StageModel
 
-OPEN = Limits(-1e4, 1e4)
+OPEN, MS = Limits(-1e4, 1e4), 1_000_000
 
 
 @given(cases_and_paths(), st.lists(st.floats(0.0, 1.0), min_size=1, max_size=20))
@@ -149,3 +152,64 @@ def test_without_a_past_the_model_starts_where_it_says():
 def test_models_that_cannot_serve(change, limits):
     with pytest.raises(SlpiError, match="^[^\n]+$"):
         take_over(replace(AXIS, **change), limits)
+
+
+def held(effects=(), feedback=False, **limits):
+    """Return a controller that holds 10 um, and the time (ns)."""
+    loops = [LoopSettings(feedback, PidGains(1e5, 1e6), 1.0)]
+    made, now = Controller(["x"], [Limits(0.0, 100.0, 1000.0, **limits)], loops=loops), 10**9
+    made.configure()
+    made.use_model(StageModel({"x": replace(AXIS, effects=effects)}))
+    made.activate(now)
+    for _ in range(500):
+        now += MS
+        made.update(now, ["x"], [10e-6], now)
+        if feedback:
+            made.measure(["x"], [10e-6], now)
+    return made, now
+
+
+def advanced(made, now, seconds):
+    """Return the voltages of the next `seconds`."""
+    given = []
+    for at in range(now, now + int(seconds * 1e9), MS):
+        made.advance(at, at)
+        given.append(made.voltages[0])
+    return np.array(given)
+
+
+@pytest.mark.parametrize("feedback", [False, True], ids=["alone", "feedback"])
+@pytest.mark.parametrize("effects", [(), (Lag(0.01),), (Creep((0.5,), (0.03,)),)], ids=["none", "lag", "creep"])
+def test_a_setpoint_that_another_model_does_not_accept_moves_nothing(effects, feedback):
+    """Its displacements are elsewhere by 100 um, and so the voltage for the setpoint would be that of a limit."""
+    made, now = held(effects, feedback)
+    before = made.voltages[0]
+    assert 20.0 < before < 80.0
+    other = StageModel({"x": replace(AXIS, effects=effects).shifted(100e-6)})
+    made.use_model(other)
+    assert not made.axes[0].stream.accepted[0] <= 10e-6
+    # What has not settled goes on to be compensated, as it would be with the old model.
+    given, (same, _) = advanced(made, now, 3.0), held(effects, feedback)
+    np.testing.assert_allclose(given, advanced(same, now, 3.0), atol=1e-6)
+    assert np.abs(given - before).max() < 1.0
+    with pytest.raises(RejectedError, match="far outside"):
+        made.update(now + 4 * 10**9, ["x"], [10e-6], now + 4 * 10**9)
+
+
+@pytest.mark.parametrize("begin_s", [0.0, 1.0])
+def test_a_trajectory_that_another_model_does_not_accept_is_canceled(begin_s):
+    made, now = held()
+    times, path = np.arange(1, 500) * 4 * MS, (10e-6 + np.linspace(0.0, 2e-6, 499))[:, None]
+    made.follow(["x"], times, path, now + int(begin_s * 1e9), now, now)
+    advanced(made, now, 0.1)
+    now += 10**8
+    # One that accepts it leaves it as it is.
+    made.use_model(StageModel({"x": AXIS.shifted(0.1e-6)}))
+    assert made.trajectory.on and not made.trajectory.refused
+    before = made.voltages[0]
+    made.use_model(StageModel({"x": AXIS.shifted(100e-6)}))
+    assert not made.trajectory.on and made.stopped is StopReason.CANCELED
+    assert "axis 'x'" in made.trajectory.refused and "accepted" in made.trajectory.refused
+    assert np.abs(advanced(made, now, 3.0) - before).max() < 1e-9
+    made.follow(["x"], times, path + 100e-6, 0, now + 4 * 10**9, now + 4 * 10**9)
+    assert made.trajectory.on and not made.trajectory.refused

@@ -220,3 +220,29 @@ def test_creep_goes_on_over_a_restart(tmp_path):
     # What does not fit the model is ignored.
     wrong = {name: replace(each, relaxing={"creep": (1e-6,), "none": (1.0,)}) for name, each in again.items()}
     Controller(NAMES, LIMITS).use_model(RICH, wrong)
+
+
+@pytest.mark.parametrize("feedback", [False, True], ids=["alone", "feedback"])
+def test_it_outlives_a_cleanup(feedback):
+    bench = Bench(PLAIN, feedback=feedback)
+    bench.run(0.1, 0.5)
+    controller = bench.controller
+    controller.set_zero(bench.now_ns)
+    bench.run(0.5, 0.3)
+    zeros, voltages = [axis.zero for axis in controller.axes], list(controller.voltages)
+    told = [axis.stream.uncoupled_displacement for axis in controller.axes]
+    controller.deactivate(bench.now_ns)
+    for _ in range(2):
+        controller.cleanup()
+        controller.configure()
+    controller.use_model(PLAIN)
+    controller.activate(bench.now_ns)
+    assert [axis.zero for axis in controller.axes] == zeros and zeros[0].source == SENSOR
+    assert [axis.stream.uncoupled_displacement for axis in controller.axes] == pytest.approx(told, abs=1e-12)
+    assert list(controller.voltages) == voltages
+    controller.deactivate(bench.now_ns)
+    controller.cleanup()
+    # Another model begins with the zero of its calibration, and so does the first one after it.
+    for model in (RICH, PLAIN):
+        controller.use_model(model)
+        assert {(axis.zero.source, axis.zero.offset) for axis in controller.axes} == {(CALIBRATION, 0.0)}

@@ -1,6 +1,7 @@
 """A run on a cluster within this process: rows, references, changes, exchange, continuation."""
 
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -15,7 +16,7 @@ import slpi_ros
 from slpi_ros.cli import main
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.fleet import bags, cluster, run
-from slpi_ros.fleet.pages import DOCUMENT, PAGE
+from slpi_ros.fleet.pages import DOCUMENT, PAGE, report_fleet
 from slpi_ros.fleet.results import TABLE, Results
 from slpi_ros.fleet.sources import Bag, find_bags
 from slpi_ros.io.bag_writer import write_bag
@@ -131,6 +132,22 @@ def test_a_bag_of_an_unknown_stage_stands_alone(stages, client, tmp_path):
     for day in (0, 1):
         stages.write(tmp_path, "a", day, name="")
     assert list(run([tmp_path], client=client, diagnose=False).verdict) == [bags.IDENTIFIED] * 2
+
+
+@pytest.mark.parametrize("storage", ["mcap", "sqlite3"])
+def test_bags_of_a_folder_whose_name_is_not_utf8(stages, client, tmp_path, storage):
+    folder = tmp_path / os.fsdecode(b"Me\xdfreihe")
+    for day, gain in ((0, 1.0), (5, 1.03)):
+        write_bag(folder / f"a-{day}", stages.record("a", day, gain), storage=storage)
+    (folder / "broken.mcap").write_bytes(b"")
+    lines, usable = report_fleet([str(folder)], str(tmp_path / "out"), client=client, diagnose=False)
+    rows = by_name(pd.read_parquet(tmp_path / "out" / TABLE))
+    assert {name: row.verdict for name, row in rows.items()} == {
+        "a-0": bags.IDENTIFIED, "a-5": bags.CHANGED, "broken": bags.REFUSED
+    }  # fmt: skip
+    assert usable and len(lines) == 4 and all("Me\\udcdfreihe" in row.bag for row in rows.values())
+    assert (tmp_path / "out" / PAGE).is_file()
+    assert len(run([folder], tmp_path / "out", client=client, diagnose=False)) == 3
 
 
 def test_what_cannot_be_run(fleet, client, tmp_path):

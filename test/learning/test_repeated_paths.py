@@ -123,7 +123,7 @@ def test_limits_are_kept_and_forgetting_removes_the_files(model, tmp_path):
     assert learned.axes["x"].limited_by == "learn_limit"
     beside = tmp_path / "learned.other.json"
     beside.write_text("{}")
-    assert paths.forget() == 1
+    assert paths.forget() == (1, "")
     assert [file.name for file in tmp_path.iterdir()] == ["learned.other.json"]
     assert paths.load() == []
 
@@ -142,3 +142,28 @@ def test_the_paths_that_came_last_are_kept(model, tmp_path):
         way = sampled(100.0, 1e-6 + 1e-8 * k)
         paths.learn(passed(way, 0.0, Stage(way.desired["x"][0]))[0])
     assert len(kept_files(prefix)) == MOST_PATHS
+
+
+@pytest.mark.parametrize("learn_period", [0.0, 0.1])
+def test_a_long_path_keeps_the_points_that_were_given(learn_period):
+    # 60 s at 1 kHz, a triangle of 10 Hz and 10 um: between samples 6 ms apart its turns would lose 0.6 um.
+    times = np.arange(60_001) * 1_000_000
+    triangle = 10e-6 * np.abs((times / 1e8) % 1.0 * 2.0 - 1.0)
+    way = SampledPath.of(["x"], times, triangle[:, None], 1e-3, learn_period)
+    correction = np.full(way.t.size, 5e-9)
+    names, out_ns, positions = way.corrected({"x": correction}, 1e-3)
+    assert list(names) == ["x"] and np.abs(out_ns - times).max() <= 1
+    assert np.abs(positions[:, 0] - triangle - 5e-9).max() < 1e-12
+
+
+def test_a_file_that_cannot_be_removed_is_told_and_all_others_are(model, tmp_path):
+    prefix = str(tmp_path / "learned")
+    paths, ways = RepeatedPaths(model, prefix), [sampled(100.0, 1e-6 + 1e-8 * k) for k in range(3)]
+    for way in ways:
+        paths.learn(passed(way, 0.0, Stage(way.desired["x"][0]))[0])
+    stays = tmp_path / f"learned.{ways[1].identity[:12]}.json"
+    stays.unlink()
+    stays.mkdir()
+    count, left = paths.forget()
+    assert count == 3 and left.startswith(f"{stays}: cannot be removed: ")
+    assert list(tmp_path.iterdir()) == [stays] and not paths.known

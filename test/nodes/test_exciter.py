@@ -5,6 +5,7 @@ import signal
 import time
 from collections import deque
 from contextlib import contextmanager
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -22,7 +23,7 @@ from trajectory_msgs.msg import JointTrajectory  # noqa: E402
 from slpi_ros.compensator.listening import LOOK_WITHOUT_NS  # noqa: E402
 from slpi_ros.errors import UsageError  # noqa: E402
 from slpi_ros.excitation.drives import excite  # noqa: E402
-from slpi_ros.nodes.exciter import DECLARATIONS, ExciterSettings  # noqa: E402
+from slpi_ros.nodes.exciter import DECLARATIONS, Exciter, ExciterSettings  # noqa: E402
 
 RATE = 100.0
 LIMITS = {"voltage_min": 0.0, "voltage_max": 100.0, "rate": RATE}
@@ -157,6 +158,20 @@ class TestAnExciterThatWaits:
             np.testing.assert_allclose(listener.v[:seen], wanted[:seen], atol=500.0 / RATE)
             assert fastest(listener.v) <= 2 * 500.0 * (1 + 1e-9)
         assert node.process.poll() is None
+
+    def test_a_drive_keeps_the_limits_that_it_began_with(self, waiting):
+        graph, node, listener = waiting
+        listener.commands.clear()
+        assert graph.set_parameters("exciter", repeat=True) == ""
+        assert call(graph, "start").success
+        listener.wait_for_motion()
+        assert holds(graph.set_parameters("exciter", voltage_max=60.0), "voltage_max", "~/stop")
+        # What the next drive begins with may be set meanwhile.
+        assert graph.set_parameters("exciter", repeat=False) == ""
+        call(graph, "stop")
+        graph.spin_until(lambda: "stopped after" in node.stderr.split("exciting")[-1], "the end of the drive")
+        for top in (60.0, 100.0):
+            assert graph.set_parameters("exciter", voltage_max=top) == ""
 
     def test_a_drive_reaches_the_stage_sample_by_sample(self, waiting):
         graph, node, listener = waiting
@@ -481,3 +496,19 @@ def test_it_drives_nothing_that_two_report():
         call(graph, "start")
         graph.spin_until(lambda: "two publishers" in node.stderr, "that both are named")
         assert not listener.commands
+
+
+@pytest.mark.parametrize("busy", [{"_waiting": True}, {"_playback": object()}])
+def test_neither_a_drive_nor_one_that_waits_takes_other_limits(busy):
+    def of(**given):
+        return ExciterSettings.of({one.name: one.default for one in DECLARATIONS} | LIMITS | given)
+
+    def required(settings, **state):
+        begun = SimpleNamespace(settings=of())
+        node = SimpleNamespace(**{"_waiting": False, "_playback": None, "_parameter_set": begun} | state)
+        Exciter._require_as_begun(node, settings)
+
+    for name, value in {"voltage_min": 5.0, "voltage_max": 60.0, "slew_limit": 500.0, "rate": 50.0}.items():
+        assert holds(refusal(UsageError, required, of(**{name: value}), **busy), name, "~/stop")
+        required(of(**{name: value}))
+    required(of(duration=20.0, repeat=True, voltage_max=[100]), **busy)

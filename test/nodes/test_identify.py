@@ -7,8 +7,9 @@ import signal
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -39,8 +40,16 @@ from slpi_ros.io.record import Record  # noqa: E402
 from slpi_ros.io.schemas import validate  # noqa: E402
 from slpi_ros.model.document import format_model, load_model, parse_model, save_model  # noqa: E402
 from slpi_ros.model.sensor import Sensor  # noqa: E402
-from slpi_ros.nodes.identify import DECLARATIONS, IdentifySettings  # noqa: E402
-from slpi_ros.nodes.jobs import DiagnosisRequest, FitOutcome, FitRequest, WorkerProcess, fit, run_diagnosis  # noqa: E402
+from slpi_ros.nodes.identify import DECLARATIONS, Identify, IdentifySettings  # noqa: E402
+from slpi_ros.nodes.jobs import (  # noqa: E402
+    DiagnosisRequest,
+    FitOutcome,
+    FitRequest,
+    StageIdentity,
+    WorkerProcess,
+    fit,
+    run_diagnosis,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -325,6 +334,61 @@ def test_a_bag_of_another_stage_replaces_no_model(tmp_path, other, why):
         assert strange in client.identified(4)
 
 
+@pytest.mark.parametrize("where", ["file", pytest.param("topic", marks=pytest.mark.long)])
+def test_a_bag_of_another_stage_replaces_no_model_after_a_restart(bag, tmp_path, where):
+    """It came while the node was down, and is the newest one."""
+    watched, output = tmp_path / "watched", tmp_path / "model.json"
+    model = identify(read_bag(bag), "pi")
+    strange = write_calibration(watched / "strange", seed=2, hardware_id="stage 8")
+    given = {"watch_directory": str(watched)}
+    if where == "file":
+        save_model(model, output)
+        given["output"] = str(output)
+    before = format_model(model)
+    with on_graph() as other:
+        publisher = other.node.create_publisher(String, "stage_model", LATCHED)
+        if where == "topic":
+            publisher.publish(String(data=before))
+        with identifying(**given) as client:
+
+            def own() -> list[str]:
+                return [message.data for message in client.models if message.data != before]
+
+            client.failed(strange)
+            assert not own()
+            if where == "file":
+                assert without_time(output.read_text()) == without_time(before)
+            # What leaves open which stage it is of does not make it forgotten.
+            write_calibration(watched / "nameless", seed=3, hardware_id="")
+            client.graph.spin_until(own, "a model")
+            again = write_calibration(watched / "strange again", seed=4, hardware_id="stage 8")
+            client.failed(again)
+            assert len(own()) == 1
+
+
+@pytest.mark.parametrize("where", ["topic", "file"])
+def test_watched_bags_are_of_the_stage_of_the_model_in_use(bag, tmp_path, where):
+    model, output = identify(read_bag(bag), "pi"), tmp_path / "model.json"
+    document = format_model(model)
+    strange = write_calibration(tmp_path / "strange", seed=2, hardware_id="stage 8")
+    nameless = write_calibration(tmp_path / "nameless", seed=2, hardware_id="")
+    if where == "file":
+        save_model(model, output)
+    given = {"output": str(output), "in_use": document if where == "topic" else ""}
+
+    def fitted(path: str, **more: Any) -> FitOutcome:
+        return fit(FitRequest((path,), "stage_state", "pi", None, None, **given | more))
+
+    for unconditional in (False, True):
+        refused = fitted(strange, as_in_use=True, unconditional=unconditional)
+        assert not refused.document and strange in refused.error and "'stage 8'" in refused.error
+    taken = fitted(nameless, as_in_use=True)
+    assert taken.document and taken.stage == StageIdentity("stage 7", ("x",))
+    # Who names a bag means it, and where the stage is known it counts.
+    assert fitted(strange).document
+    assert fitted(strange, as_in_use=True, stage=StageIdentity("stage 8", ("x",))).document
+
+
 def test_a_small_record_does_not_replace_a_model_of_the_whole_range(tmp_path):
     """Unless somebody asks for it; the line says what is less, by how much, and what is wanted."""
     watched, output = tmp_path / "watched", tmp_path / "model.json"
@@ -451,6 +515,31 @@ def test_a_diagnosis_reads_all_bags_of_the_fit(bag, humming_bag, tmp_path, monke
     document = format_model(identify(read_bag(bag), "pi"))
     outcome = run_diagnosis(DiagnosisRequest((bag, humming_bag), "stage_state", document, str(tmp_path)))
     assert outcome.error == "enough" and seen == [bag, humming_bag]
+
+
+def test_a_diagnosis_judges_the_part_that_was_fitted(tmp_path, monkeypatch):
+    """As of a bag that is usable up to where its clock was set back."""
+    back = Path(write_calibration(tmp_path / "whole", samples=2000))
+    record = read_bag(back)
+    stamps = record.time_ns.copy()
+    stamps[1500:] -= 5_000_000_000
+    write_bag(tmp_path / "back", replace(record, time_ns=stamps))
+    seen = []
+
+    def diagnosed(records, model, *, axes, start, stop):
+        seen.append((start, stop))
+        raise RecordError("enough")
+
+    monkeypatch.setattr("slpi_ros.diagnosis.diagnose.diagnose", diagnosed)
+    request = FitRequest((str(tmp_path / "back"),), "stage_state", "pi", 0.5, 7.0, "")
+    published = SimpleNamespace(
+        _diagnosis=SimpleNamespace(use=seen.append),
+        _in_use=SimpleNamespace(publish=lambda document: None),
+        get_logger=lambda: SimpleNamespace(info=lambda text: None),
+    )
+    Identify._publish(published, request, fit(request))
+    outcome = run_diagnosis(replace(seen.pop(), folder=str(tmp_path / "out")))
+    assert outcome.error == "enough" and seen == [(0.5, 7.0)]
 
 
 def test_a_diagnosis_that_cannot_be_is_told(bag, tmp_path):

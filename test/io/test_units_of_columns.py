@@ -1,0 +1,18 @@
+"""The table of a path that a calibration shall cover."""
+
+import pytest
+
+from slpi_ros.io.desired import read_path
+
+
+@pytest.mark.parametrize("header", ["x_um,y_nm", "x_m,y_um", "x_nm,y_m,y_um"])
+def test_no_axis_is_lost_whose_column_is_in_another_unit(tmp_path, header):
+    scales = {"m": 1.0, "um": 1e-6, "nm": 1e-9}
+    columns, path = header.split(","), tmp_path / "path.csv"
+    rows = [",".join(str(2 * k + row) for k in range(len(columns))) for row in (1, 2)]
+    path.write_text(f"time_s,{header}\n0,{rows[0]}\n1,{rows[1]}\n")
+    read = read_path(path)[1]
+    assert list(read) == ["x", "y"]
+    for name, values in zip(columns[:2], ([1.0, 2.0], [3.0, 4.0]), strict=True):
+        axis, unit = name.split("_")
+        assert read[axis] == pytest.approx([scales[unit] * value for value in values])

@@ -371,7 +371,8 @@ class Axis:
             return
         low, high = self.stream.accepted
         expected = self.expected
-        x = self.loop.read(displacement, expected, now_ns, fresh, low <= displacement <= high, self.motion.swing)
+        within = low <= displacement <= high
+        x = self.loop.read(displacement, expected, now_ns, fresh, within, self.motion.swing, age)
         self.check(displacement, "measured")
         if self.initial.assumed:
             if fresh:

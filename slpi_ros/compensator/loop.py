@@ -176,8 +176,10 @@ class Loop:
 
     # Readings
 
-    def read(self, y: float, expected: float, now_ns: int, fresh: bool, within: bool, swing: int = 0) -> float:
-        """Take a reading (m); return the displacement (m) without the sensor's own errors.
+    def read(
+        self, y: float, expected: float, now_ns: int, fresh: bool, within: bool, swing: int = 0, age: float = 0.0
+    ) -> float:
+        """Take a reading (m) of an `age` (s); return the displacement (m) without the sensor's own errors.
 
         `expected` (m) is where the model is. Only a `fresh` one, stamped now, counts for the zero, and only one
         `within` the accepted displacements is corrected; `swing`: of a reset, with a known memory.
@@ -185,7 +187,7 @@ class Loop:
         x = self._sensor.correct(y) if within else y
         sensed = self._expected.span(now_ns) if self._expected else ()
         if fresh and isfinite(x):
-            self.offsets.take(x, sensed[-1] if sensed else expected, swing, now_ns)
+            self.offsets.take(x, sensed[-1] if sensed else expected, swing, now_ns, age)
         return x
 
     def measure(self, x: float, expected: float, now_ns: int, watched: bool, tracking: TrackingStatistics) -> None:

@@ -21,14 +21,17 @@ class ZeroOffsets:
 
     def __init__(self) -> None:
         self._recent: deque[tuple[int, float]] = deque(maxlen=OFFSETS)
-        # With the number of the swing and the displacement of the model (m), until the axis moves otherwise.
-        self._reset: deque[tuple[int, int, float, float]] = deque(maxlen=OF_RESET)
+        # Arrival, number of the swing, reading and displacement of the model (m), age (ns), until it moves otherwise.
+        self._reset: deque[tuple[int, int, float, float, float]] = deque(maxlen=OF_RESET)
 
-    def take(self, reading: float, expected: float, swing: int, now_ns: int) -> None:
-        """Take a reading and the displacement of the model (m); `swing`: of a reset, with a known memory; 0: none."""
+    def take(self, reading: float, expected: float, swing: int, now_ns: int, age: float = 0.0) -> None:
+        """Take a reading of an `age` (s) and the present displacement of the model (m).
+
+        `swing`: of a reset, with a known memory; 0: none.
+        """
         self._recent.append((now_ns, reading - expected))
         if swing:
-            self._reset.append((now_ns, swing, reading - expected, expected))
+            self._reset.append((now_ns, swing, reading, expected, age * SECOND_NS))
 
     def leave_reset(self) -> None:
         """Forget the reset: the axis moves otherwise."""
@@ -57,11 +60,13 @@ class ZeroOffsets:
 
     def _of_reset(self) -> float | None:
         """Return the offset (m) of the reset; None without two wide swings one after the other."""
-        t, swing, offset, expected = np.array(self._reset).T
+        t, swing, reading, expected, age = np.array(self._reset).T
         t, first = np.unique(t, return_index=True)
         if t.size < 2:
             return None
-        swing, offset, expected = swing[first], offset[first], expected[first]
+        swing, reading, expected, age = swing[first], reading[first], expected[first], age[first]
+        # Some are longer on their way than others; what their clock is ahead by counts as late, below.
+        offset = reading - np.interp(t - age, t, expected)
         velocity, swings = np.gradient(expected, t), []
         for number in np.unique(swing):
             own = swing == number

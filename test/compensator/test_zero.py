@@ -170,6 +170,23 @@ def test_readings_that_come_late_do_not_move_the_zero_of_a_reset(late):
     assert moved == {name: pytest.approx(moved, abs=20e-9) for name, moved in MOVED.items()}
 
 
+def test_readings_that_are_late_in_one_direction_alone_do_not_move_the_zero_of_a_reset():
+    """A busy computer delays some readings; their stamps tell when they were read, by a clock that may be ahead."""
+    bench, ahead = Bench(PLAIN), 3
+    bench.sample(0.2)
+    controller, seen = bench.controller, []
+    controller.reset_memory(4, 400.0, [0.0, 0.0], bench.now_ns)
+    while controller.mode is OperatingMode.RESETTING:
+        bench.now_ns += MS
+        before = list(controller.voltages)
+        controller.advance(bench.now_ns, bench.now_ns)
+        seen.append(bench.read(measuring=False).tolist())
+        late = 12 if controller.voltages[0] > before[0] else 0
+        controller.measure(NAMES, seen[-1 - min(late, len(seen) - 1)], bench.now_ns, age=(late - ahead) * DT)
+    moved = {axis.name: axis.loop.offsets.present(bench.now_ns) for axis in controller.axes}
+    assert moved == {name: pytest.approx(moved, abs=20e-9) for name, moved in MOVED.items()}
+
+
 def test_right_after_a_reset_the_zero_is_that_of_its_swings():
     bench = Bench(PLAIN)
     bench.sample(0.2)

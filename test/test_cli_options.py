@@ -122,6 +122,32 @@ def test_a_drive_at_no_rate(rate, more, capsys, folder):
     assert "--rate" in refused(capsys, folder, *EXCITE, "--voltage-max", "9", f"--rate={rate}", *more)
 
 
+def test_a_seed_that_is_none(capsys, folder):
+    for more in ((), ("--for-response",)):
+        assert "seed -1" in refused(capsys, folder, *EXCITE, "--voltage-max", "100", "--seed", "-1", *more)
+
+
+@pytest.mark.parametrize("rate", ["1e19", "1e308"])
+def test_more_samples_of_a_path_than_a_drive_has(rate, capsys, folder):
+    path = folder.parent / "path.csv"
+    write_table(path, np.arange(3.0), {"x": np.array([0.0, 1e-6, 0.0])}, "m")
+    command = (*EXCITE, "--voltage-max", "100", "--rate", rate, "--for-path", str(path))
+    assert "10000000 samples" in refused(capsys, folder, *command)
+
+
+@pytest.mark.parametrize(
+    "command",
+    [IDENTIFY, DIAGNOSE, ("verify", BAG, "--model", "m.json"), ("refit", "m.json", BAG, "-o", "n.json")],
+)
+def test_a_part_that_ends_before_it_begins(command, capsys, folder, tmp_path_factory):
+    model = tmp_path_factory.mktemp("model") / "m.json"
+    save_model(two_axes(), model)
+    words = [
+        str(model) if word in ("m.json", "no such model") and command is not IDENTIFY else word for word in command
+    ]
+    assert "start 5.0 s is not before stop 1.0 s" in refused(capsys, folder, *words, "--start", "5", "--stop", "1")
+
+
 def subparsers():
     whole = parser()
     (found,) = (action for action in whole._actions if isinstance(action, argparse._SubParsersAction))

@@ -4,6 +4,7 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import yaml
 from reports.pages import parsed, trace
@@ -102,6 +103,23 @@ def test_a_file_by_somebody_else_and_the_model_stay(folder, tmp_path, capsys):
         before = output.read_bytes()
         assert main(["tune", str(folder / "xy.json"), "-o", str(output)]) == 2
         assert str(output) in capsys.readouterr().err and output.read_bytes() == before
+
+
+@pytest.mark.parametrize("stage", ["other", ""])
+def test_a_record_of_another_stage_or_without_the_drive(stage, tmp_path, capsys):
+    from slpi_ros.io.bag_writer import write_bag
+    from slpi_ros.io.record import Record
+
+    slpi_ros.save_model(StageModel({"x": X}, "own"), tmp_path / "m.json")
+    one = np.zeros(1)
+    write_bag(tmp_path / "bag", Record(np.ones(1, dtype=np.int64), {"x": one}, {"x": one}, hardware_id=stage))
+    command = ["tune", str(tmp_path / "m.json"), str(tmp_path / "bag"), "-o", str(tmp_path / "g.yaml")]
+    assert main(command) == 1 and not (tmp_path / "g.yaml").exists()
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1 and ("several stages: 'own' (the model), 'other'" in said) == bool(stage)
+    assert ("--for-response" in said) != bool(stage)
+    assert main([*command, "--accept-stage", "other"]) == 1
+    assert "several stages" not in capsys.readouterr().err
 
 
 @pytest.mark.long

@@ -113,6 +113,7 @@ def _path_of(options: Namespace) -> tuple[dict[str, "FloatArray"], float]:
     import numpy as np
 
     from slpi_ros.calibration.drive_monitor import FARTHEST
+    from slpi_ros.excitation.legs import DriveSpec
     from slpi_ros.io.desired import read_path
     from slpi_ros.model.document import load_model
     from slpi_ros.model.stage_model import check_time
@@ -126,6 +127,8 @@ def _path_of(options: Namespace) -> tuple[dict[str, "FloatArray"], float]:
     if farthest > FARTHEST:
         raise UsageError(f"{options.for_path}: a displacement of {farthest:.4g} m; give metres")
     rate = max(RATE, 1.0 / float(np.median(steps[steps > 0.0]))) if options.rate is None else options.rate
+    # Limits and number of samples are possible ones.
+    spec = DriveSpec(options.voltage_min, options.voltage_max, float(t[-1]), rate)
     if options.model:
         model = load_model(options.model)
         try:
@@ -134,7 +137,6 @@ def _path_of(options: Namespace) -> tuple[dict[str, "FloatArray"], float]:
             raise type(error)(f"{options.for_path}, {error}") from None
         volts = {axis: v for axis, (v, _) in answers.items()}
     else:
-        low, span = options.voltage_min, options.voltage_max - options.voltage_min
-        volts = {axis: low + span * (y - y.min()) / (float(np.ptp(y)) or 1.0) for axis, y in desired.items()}
-    even = np.arange(int(t[-1] * rate) + 1) / rate
+        volts = {axis: spec.low + spec.span * (y - y.min()) / (float(np.ptp(y)) or 1.0) for axis, y in desired.items()}
+    even = np.arange(int(spec.duration * rate) + 1) / rate
     return {axis: np.interp(even, t, v) for axis, v in volts.items()}, rate

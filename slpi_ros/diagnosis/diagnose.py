@@ -26,12 +26,13 @@ from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.bases import PlayBasis
 from slpi_ros.identification.error_statistics import with_statistics
 from slpi_ros.identification.free_run import FreeRun, free_run, likely_starts, rms_of
+from slpi_ros.identification.held_readings import corrected_fresh
 from slpi_ros.identification.progress import report_progress
 from slpi_ros.identification.refit import require_own
 from slpi_ros.identification.repeatability import Repeatability, repeatability_of
 from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import AxisModel, Start
-from slpi_ros.model.sensor import IDEAL, corrected
+from slpi_ros.model.sensor import IDEAL
 from slpi_ros.model.stage_model import StageModel
 
 # Kinds that are refitted together with the effects. Any other kind is reported as unsuitable if its error exceeds that
@@ -83,7 +84,7 @@ def diagnose(
     common_stage(records, model.hardware_id)
     _require_different(records)
     undone = {name: axis.sensor.undo for name, axis in model.axes.items() if axis.sensor}
-    records = [corrected(each, undone) for each in records]
+    records = [corrected_fresh(each, undone) for each in records]
     source = ", ".join(each.source for each in records)
     common = [axis for axis in records[0].axes if all(axis in each.axes for each in records)]
     chosen = list(axes) if axes else [axis for axis in model.axes if axis in common]
@@ -120,7 +121,7 @@ def following(
             raise UsageError(
                 f"kind '{known.kind}' is not fitted with recorded quantities; choose one of {', '.join(REFITTED)}"
             )
-        undone = [corrected(each, {axis: known.sensor.undo}) if known.sensor else each for each in records]
+        undone = [corrected_fresh(each, {axis: known.sensor.undo}) if known.sensor else each for each in records]
         with threadpool_limits(1):
             evidence = evidence_of(undone, axis, replace(known, sensor=IDEAL), start, stop)
             names = [name for name, effect in EFFECTS.items() if effect.follows_quantities]

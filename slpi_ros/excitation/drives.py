@@ -83,7 +83,7 @@ def excite(
         begin, end = turns[number], turns[number + 1]
         turn = replace(specs[axis], duration=(end - begin) / rate)
         voltage[axis] = np.full(steps + 1, rest)
-        voltage[axis][begin : end + 1] = _turn(turn, rest, drive, _generator(seed, number))
+        voltage[axis][begin : end + 1] = _turn(turn, rest, drive, generator(seed, number))
     return Drive(np.arange(steps + 1) / rate, voltage, specs, _why(drive))
 
 
@@ -152,7 +152,8 @@ def _each(name: str, given: float | Sequence[float], axes: Sequence[str]) -> lis
     return [float(value) for value in values]
 
 
-def _generator(seed: int, number: int) -> np.random.Generator:
+def generator(seed: int, number: int) -> np.random.Generator:
+    """Return the random numbers of the axis of a number; UsageError for a negative seed."""
     if seed < 0:
         raise UsageError(f"drive: seed {seed}; give 0 or more")
     return np.random.default_rng([seed, number])

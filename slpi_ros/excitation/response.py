@@ -7,7 +7,7 @@ import numpy as np
 
 from slpi_ros.arrays import FloatArray
 from slpi_ros.errors import UsageError
-from slpi_ros.excitation.drives import Drive
+from slpi_ros.excitation.drives import Drive, generator
 from slpi_ros.excitation.legs import DriveSpec
 
 # Biases, as shares of the voltage range, and periods at each: the first ones are of the transient.
@@ -40,7 +40,7 @@ def response_drive(
 ) -> Drive:
     """Return the voltages (V), one axis after the other in `duration` (s) at `rate` (Hz), within `slew` (V/s; 0: none).
 
-    UsageError if the time is too short, or the limits are none.
+    UsageError if the time is too short, the limits are none, or the seed is negative.
     """
     spec = DriveSpec(low, high, duration, rate, slew)
     each = int(spec.steps // len(axes))
@@ -52,7 +52,7 @@ def response_drive(
         )
     voltage = {}
     for number, axis in enumerate(axes):
-        rng = np.random.default_rng([seed, number])
+        rng = generator(seed, number)
         voltage[axis] = np.full(spec.steps + 1, low)
         own = _one(spec, each, size, rng)
         voltage[axis][number * each + 1 : number * each + 1 + own.size] = own

@@ -12,6 +12,7 @@ from slpi_ros.arrays import FloatArray
 from slpi_ros.arrays.rates import fastest
 from slpi_ros.errors import IdentificationError, SlpiError, UsageError, length
 from slpi_ros.identification.error_statistics import with_statistics
+from slpi_ros.identification.held_readings import corrected_fresh
 from slpi_ros.identification.least_squares import Fitted
 from slpi_ros.identification.linear_kinds import FIT_SAMPLES, fit_family, fit_multi_slope, fit_plays
 from slpi_ros.identification.progress import report_progress
@@ -20,7 +21,7 @@ from slpi_ros.identification.samples import NEVER_TURNS, Samples, select_thinned
 from slpi_ros.identification.signal_statistics import white_noise
 from slpi_ros.io.record import Record, common_stage, release
 from slpi_ros.model.axis_model import AxisModel, FitQuality, Start
-from slpi_ros.model.sensor import Sensor, corrected
+from slpi_ros.model.sensor import Sensor
 from slpi_ros.model.stage_model import StageModel
 
 FITS: dict[str, Callable[[Sequence[Samples]], Fitted]] = {
@@ -83,7 +84,7 @@ def identify(
     fit, sensor = fit_of(kind, loops_at_rest=loops_at_rest), Sensor(sensor_delay, sensor_lag)
     records = [record] if isinstance(record, Record) else list(record)
     if sensor:
-        records = [corrected(part, dict.fromkeys(axes or part.axes, sensor.undo)) for part in records]
+        records = [corrected_fresh(part, dict.fromkeys(axes or part.axes, sensor.undo)) for part in records]
     hardware_id = common_stage(records)
     source = ", ".join(part.source for part in records)
     last = max(range(len(records)), key=lambda number: int(records[number].time_ns.max(initial=0)))

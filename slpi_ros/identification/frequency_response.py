@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from slpi_ros.arrays import FloatArray
+from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.effects.filters import Uniform
 from slpi_ros.errors import RecordError
 
@@ -61,7 +61,10 @@ class FrequencyResponse:
         """
         low = slice(0, max(3, self.frequency.size // 20))
         scale = np.median(np.abs(self.response[low]) / np.abs(model[low]))
-        off = np.abs(self.response / (scale * model) - 1.0) > within + self.relative
+        with np.errstate(divide="ignore", invalid="ignore"):
+            ratio, allowed = self.response / (scale * model), within + self.relative
+        # What is not known does not agree.
+        off = ~(np.isfinite(ratio) & np.isfinite(allowed) & (np.abs(ratio - 1.0) <= allowed))
         # Single lines are off by chance.
         off = np.convolve(off, np.ones(5), "same") > 2.5
         last = int(np.argmax(off)) - 1 if off.any() else off.size - 1
@@ -75,6 +78,7 @@ def frequency_response(t: FloatArray, v: FloatArray, y: FloatArray) -> Frequency
     ----------
     t, v, y : ndarray, shape (N,)
         Stamps (s), voltages (V) and readings (m), with periodic voltages of the same period at one or more biases.
+        Periods in which a reading is missing (NaN) are left out.
 
     Returns
     -------
@@ -83,14 +87,18 @@ def frequency_response(t: FloatArray, v: FloatArray, y: FloatArray) -> Frequency
     Raises
     ------
     RecordError
-        If no voltages repeat.
+        If no voltages repeat, or readings are missing in nearly all periods.
     """
     grid = Uniform.over(t)
     v, y = grid.on(v), grid.on(y)
     size = _period(v)
-    spectra = [_spectra(v, y, begin, end, size) for begin, end in _stretches(v, size)]
-    if not size or not spectra:
+    stretches = list(_stretches(v, size))
+    if not stretches:
         raise RecordError(f"no voltages repeat for {TRANSIENT + FEWEST} periods; {NO_DRIVE}")
+    stretches = [each for each in stretches if np.count_nonzero(_whole(y, *each, size)) >= FEWEST]
+    if not stretches:
+        raise RecordError("readings are missing in nearly all periods; check the sensor and its link, and record again")
+    spectra = [_spectra(v, y, begin, end, size) for begin, end in stretches]
     strength = np.abs(np.mean([volts[0] for volts, _, _ in spectra], axis=0))
     strong = np.sort(strength[1:])[-max(3, size // 20) :]
     excited = np.flatnonzero(strength >= EXCITED * np.median(strong))
@@ -115,13 +123,15 @@ def frequency_response(t: FloatArray, v: FloatArray, y: FloatArray) -> Frequency
         mean,
         np.sqrt(np.sum(np.square(noise), axis=0)) / count,
         np.sqrt(np.sum(np.square(distortion), axis=0) / count**2 + unlike),
-        tuple(float(v[begin:end].mean()) for begin, end in _stretches(v, size)),
+        tuple(float(v[begin:end].mean()) for begin, end in stretches),
         np.array(each),
     )
 
 
 def _period(v: FloatArray) -> int:
     """Return the number of samples after which most steps of the voltage repeat; 0: none."""
+    if v.size <= 2 * SHORTEST:
+        return 0
     steps = np.diff(v)
     steps = steps - steps.mean()
     spectrum = np.fft.rfft(steps, 2 * steps.size)
@@ -160,16 +170,18 @@ def _stretches(v: FloatArray, size: int) -> Iterator[tuple[int, int]]:
 
 
 def _spectra(v: FloatArray, y: FloatArray, begin: int, end: int, size: int) -> tuple[ComplexArray, ComplexArray, int]:
-    """Return spectra of voltages and readings, (P, size // 2 + 1) each, of P periods, without the trend of these."""
-    count = (end - begin) // size
-    place = np.arange(count * size) - 0.5 * count * size
+    """Return spectra of voltages and readings, (P, size // 2 + 1) each, of P whole periods, without their trend."""
+    count, whole = (end - begin) // size, _whole(y, begin, end, size)
+    place = (np.arange(count * size) - 0.5 * count * size).reshape(count, size)[whole]
+    volts, readings = (each[begin:end].reshape(count, size)[whole] for each in (v, y))
     # Creep and drift go on: a parabola through the means of the periods.
-    means = y[begin:end].reshape(count, size).mean(axis=1)
-    middle = (np.arange(count) + 0.5 - 0.5 * count) * size
-    trend = np.polynomial.Polynomial.fit(middle, means, min(2, count - 1))
-    rest = y[begin:end] - trend(place)
-    volts, readings = (each.reshape(count, size) for each in (v[begin:end], rest))
-    return np.fft.rfft(volts, axis=1), np.fft.rfft(readings, axis=1), count
+    trend = np.polynomial.Polynomial.fit(place.mean(axis=1) + 0.5, readings.mean(axis=1), min(2, len(place) - 1))
+    return np.fft.rfft(volts, axis=1), np.fft.rfft(readings - trend(place), axis=1), len(place)
+
+
+def _whole(y: FloatArray, begin: int, end: int, size: int) -> Mask:
+    """Return the mask, (P,), of the periods from `begin` to `end` in which no reading is missing."""
+    return np.asarray(np.isfinite(y[begin:end]).reshape(-1, size).all(axis=1))
 
 
 def _beside(answer: FloatArray, spread: FloatArray, excited: NDArray[np.int64]) -> FloatArray:

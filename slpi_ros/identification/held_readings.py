@@ -1,5 +1,6 @@
 """Readings of a sensor that is slower than its record: each one repeated until the next (sample and hold)."""
 
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -10,6 +11,7 @@ from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.identification.bad_readings import after_jumps
 from slpi_ros.identification.signal_statistics import FEWEST, digit, median_rms, spread
 from slpi_ros.io.record import Record
+from slpi_ros.model.sensor import corrected
 
 # Share of repeated rows, beyond those that are equal by their digits, from which readings are held: one row in three
 # where a sensor's readings last for one or two rows.
@@ -190,6 +192,40 @@ def without_held(record: Record, axis: str) -> tuple[Record, float]:
     fresh = y.copy()
     fresh[known[~found.fresh]] = np.nan
     return replace(record, displacement={**record.displacement, axis: fresh}), found.rows
+
+
+def from_fresh(record: Record, axes: Iterable[str], change: Callable[[Record], Record]) -> Record:
+    """Return what `change` makes of a record without the held readings of some axes; `left_out` tells these later.
+
+    Readings that were equal are not after a change that depends on time, and would then count as fresh.
+    """
+    fresh, held = record, {}
+    for axis in axes:
+        if axis in record.axes:
+            fresh, rows = without_held(fresh, axis)
+            if rows > 1.0:
+                held[axis] = rows
+    changed = change(fresh)
+    if held:
+        # A change may also move readings to other rows, or leave rows out.
+        whole = change(record)
+        for axis, rows in held.items():
+            missing = ~np.isfinite(changed.displacement[axis]) & np.isfinite(whole.displacement[axis])
+            changed.derived[left_out, axis] = Held(~missing, rows)
+    return changed
+
+
+def corrected_fresh(
+    record: Record, corrections: Mapping[str, Callable[[FloatArray, FloatArray], FloatArray]]
+) -> Record:
+    """Return `corrected` of the fresh readings of a record."""
+    return from_fresh(record, corrections, lambda read: corrected(read, corrections))
+
+
+def left_out(record: Record, axis: str) -> Held | None:
+    """Return which readings of a record are missing because they were held, see `from_fresh`; None: none."""
+    found: Held | None = record.derived.get((left_out, axis))
+    return found
 
 
 def slower_sensor(rows: float, period: float) -> str:

@@ -11,7 +11,7 @@ from slpi_ros.arrays import FloatArray, IntArray
 from slpi_ros.errors import IdentificationError, length
 from slpi_ros.identification import bad_readings, drive, signal_statistics
 from slpi_ros.identification.drive import SPEED_FACTOR
-from slpi_ros.identification.held_readings import held_readings, slower_sensor
+from slpi_ros.identification.held_readings import Held, held_readings, left_out, slower_sensor
 from slpi_ros.identification.samples import NEAR_END, NEVER_TURNS, WINDOW, bounds, select_thinned, windows
 from slpi_ros.io.record import Record, release
 
@@ -131,12 +131,13 @@ def assess(record: Record, axis: str, *, start: float | None = None, stop: float
     after_reset = np.flatnonzero(samples.after_reset)[:1]
     first, until = bounds(record, start, stop)
     stamps, v, y = record.time_ns, record.voltage[axis], record.displacement[axis]
-    clocks, voltages, displacements = [], [], []
+    before, clocks, voltages, displacements = left_out(record, axis), [], [], []
     for begin, end in windows(v, first, until) if until - first > WINDOW else [(first, until)]:
         # Windows of a long record share a sample, so that every time step is counted.
         part = slice(max(begin - 1, first), end)
         t = (stamps[part] - stamps[0]) * 1e-9
-        voltage, displacement = _signals(t, v[part], y[part])
+        held = Held(before.fresh[part], before.rows) if before else None
+        voltage, displacement = _signals(t, v[part], y[part], held)
         clocks.append(_clock(t, v[part], NEAR_END * voltage.range))
         voltages.append(voltage)
         displacements.append(displacement)
@@ -216,10 +217,12 @@ def _missing(steps: FloatArray) -> int:
     return int(rises[rises > 0.0].sum())
 
 
-def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality, SignalQuality]:
-    """Return the quality of voltage and displacement, shape (N,) each."""
+def _signals(t: FloatArray, v: FloatArray, y: FloatArray, before: Held | None) -> tuple[SignalQuality, SignalQuality]:
+    """Return the quality of voltage and displacement, shape (N,) each; `before`: held readings that were left out."""
     both = np.isfinite(v) & np.isfinite(y)
     missing = [int(np.count_nonzero(~np.isfinite(signal))) for signal in (v, y)]
+    if before:
+        missing[1] -= int(np.count_nonzero(~before.fresh))
     infinite = [int(np.count_nonzero(np.isinf(signal))) for signal in (v, y)]
     if not both.all():
         t, v, y = t[both], v[both], y[both]
@@ -247,7 +250,9 @@ def _signals(t: FloatArray, v: FloatArray, y: FloatArray) -> tuple[SignalQuality
         voltage, spikes=voltage.spikes + np.setdiff1d(far_v, off_v).size, infinite=infinite[0], alternating=twice
     )
     spikes = displacement.spikes + np.setdiff1d(far_y, off_y).size
-    return voltage, replace(displacement, spikes=spikes, infinite=infinite[1], held=held.rows)
+    return voltage, replace(
+        displacement, spikes=spikes, infinite=infinite[1], held=max(held.rows, before.rows if before else 1.0)
+    )
 
 
 def _signal(

@@ -22,6 +22,7 @@ from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.identification.bases import Basis, PlayBasis, SurfaceBasis
 from slpi_ros.identification.free_run import Match, match
+from slpi_ros.identification.held_readings import from_fresh
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem, solve_free
 from slpi_ros.identification.linear_kinds import FIT_SAMPLES
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
@@ -103,7 +104,7 @@ def refit(
     if not shared:
         raise UsageError(f"{record.source} holds none of the model's axes {', '.join(model.axes)}")
     surrounded = model.stage_only.surrounded(record)
-    applied, record = record, _without_effects(surrounded, model.correct(record), shared)
+    applied, record = record, _bare(record, model, surrounded, shared)
     updated, changes = dict(model.axes), {}
     for name in shared:
         where = f"{record.source}: axis '{name}': "
@@ -126,12 +127,20 @@ def refit(
     return replace(model, axes=updated, created=datetime.now(UTC).isoformat(timespec="seconds")), changes
 
 
+def _bare(record: Record, model: StageModel, surrounded: StageModel, shared: Sequence[str]) -> Record:
+    """Return the record without what the model knows of its sensors, and of effects in its surroundings."""
+    changed = [axis for axis in shared if model.axes[axis].effects or model.axes[axis].corrects]
+    return from_fresh(record, changed, lambda read: _without_effects(surrounded, model.correct(read), shared))
+
+
 def _without_effects(model: StageModel, record: Record, shared: Sequence[str]) -> Record:
     """Return the record with the contribution of the model's effects of the stage removed."""
     if not any(model.axes[axis].effects for axis in shared):
         return record
     t, voltage, displacement = record.t, dict(record.voltage), dict(record.displacement)
-    known = {axis: _held(record.voltage[axis]) for axis in shared}
+    # Axes that are not updated couple into those that are.
+    moving = [axis for axis in model.axes if axis in record.axes and np.isfinite(record.voltage[axis]).any()]
+    known = {axis: _held(record.voltage[axis]) for axis in dict.fromkeys((*shared, *moving))}
     simulated = model.simulate(t, known)
     for axis in shared:
         own = model.axes[axis]

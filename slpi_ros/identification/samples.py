@@ -18,7 +18,7 @@ from slpi_ros.identification.bad_readings import (
     stuck,
     without,
 )
-from slpi_ros.identification.held_readings import held_readings
+from slpi_ros.identification.held_readings import held_readings, left_out
 from slpi_ros.identification.signal_statistics import without_noise
 from slpi_ros.io.record import Record, each_block, first_step_back, release
 
@@ -175,9 +175,16 @@ def _selected(record: Record, axis: str, start: float | None, stop: float | None
     fitted[:first] = False
     driven = np.isfinite(v)
     _require_enough(record, axis, int(np.count_nonzero(fitted & driven)), start, stop)
+    where, rows = f"{record.source}: axis '{axis}'", _rows_held(record, axis)
     if driven.all():
-        return _examined(t[:until], v, y, fitted, f"{record.source}: axis '{axis}'")
-    return _examined(t[:until][driven], v[driven], y[driven], fitted[driven], f"{record.source}: axis '{axis}'")
+        return _examined(t[:until], v, y, fitted, where, rows)
+    return _examined(t[:until][driven], v[driven], y[driven], fitted[driven], where, rows)
+
+
+def _rows_held(record: Record, axis: str) -> float:
+    """Return the rows for which each reading was held, if held ones have been left out; else 1."""
+    found = left_out(record, axis)
+    return found.rows if found else 1.0
 
 
 def select_thinned(
@@ -209,7 +216,7 @@ def select_thinned(
         own = (at >= begin) & (at < end)
         count += int(np.count_nonzero(fitted & own))
         if np.count_nonzero(fitted) >= FEWEST:
-            samples = _examined(t, v, y, fitted, "")
+            samples = _examined(t, v, y, fitted, "", _rows_held(record, axis))
         else:
             samples = Samples(v, np.where(fitted, y, 0.0), np.zeros(v.size, dtype=bool))
         kept = own & samples.thinning(max(1, round(samples.v.size / every)))
@@ -272,10 +279,11 @@ def _require_enough(record: Record, axis: str, count: int, start: float | None, 
         )
 
 
-def _examined(t: FloatArray, v: FloatArray, y: FloatArray, fitted: Mask, where: str) -> Samples:
+def _examined(t: FloatArray, v: FloatArray, y: FloatArray, fitted: Mask, where: str, rows: float) -> Samples:
     """Return the samples, with a smooth voltage; outliers and repeated, stuck and mixed readings are not `fitted`."""
     # The mask `fitted` has at least `FEWEST` samples and is modified in place. `where` names the record in the error of
-    # signals without motion; "" for a part of a record, which is not tested.
+    # signals without motion; "" for a part of a record, which is not tested. Each reading was held for `rows`, if held
+    # ones have been left out before.
     known = np.flatnonzero(fitted)
     held = held_readings(y[known], v[known])
     fitted[known[~held.fresh]] = False
@@ -296,7 +304,7 @@ def _examined(t: FloatArray, v: FloatArray, y: FloatArray, fitted: Mask, where: 
     # If the record has mixed readings, only these are excluded: they look like outliers, too.
     fitted[known[mixed.readings if mixed.side else off_y]] = False
     smooth = without_noise(t, without(v, known[off_v]))
-    return Samples(smooth, y, fitted, mixed=mixed.readings.size, side=mixed.side, held=held.rows)
+    return Samples(smooth, y, fitted, mixed=mixed.readings.size, side=mixed.side, held=max(held.rows, rows))
 
 
 def part_of(t: FloatArray, start: float | None, stop: float | None) -> tuple[int, int]:

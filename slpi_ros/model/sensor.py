@@ -76,7 +76,7 @@ class Sensor:
             near = np.clip(np.searchsorted(t, late), 1, t.size - 1)
             near -= late - t[near - 1] < t[near] - late
         ahead = late - t[near]
-        slopes = _slopes(t, np.interp(t, t[known], y[known]), self.lag)
+        slopes = _slopes(t, np.interp(t, t[known], _without_spikes(t[known], y[known])), self.lag)
         then = np.interp(late, t, slopes)
         x: FloatArray = y[near] + 0.5 * (then + slopes[near]) * ahead + self.lag * then
         x[np.abs(ahead) > usual_step(t)] = np.nan
@@ -188,7 +188,7 @@ def _slopes(t: FloatArray, y: FloatArray, lag: float) -> FloatArray:
     grid = Uniform.over(t)
     if not grid.dt:
         return np.zeros_like(y)
-    even = grid.on(_without_spikes(y))
+    even = grid.on(y)
     beside = min(max(BESIDE, round(0.5 * lag / grid.dt)), (even.size - 1) // 2)
     if beside < BESIDE:
         return grid.off(np.gradient(even, grid.dt))
@@ -204,12 +204,15 @@ def _slopes(t: FloatArray, y: FloatArray, lag: float) -> FloatArray:
     return grid.off(slopes)
 
 
-def _without_spikes(y: FloatArray) -> FloatArray:
-    """Return readings, shape (N,), metres, with the mean of its neighbours for each single one far away from both."""
+def _without_spikes(t: FloatArray, y: FloatArray) -> FloatArray:
+    """Return readings, shape (N,), metres, with the line between its neighbours for each single one far from it."""
     if y.size < 3:
         return y
     off = np.zeros_like(y)
-    off[1:-1] = y[1:-1] - 0.5 * (y[:-2] + y[2:])
+    # Readings may be missing in between.
+    apart = t[2:] - t[:-2]
+    share = np.divide(t[1:-1] - t[:-2], apart, out=np.full(apart.size, 0.5), where=apart > 0.0)
+    off[1:-1] = y[1:-1] - y[:-2] - share * (y[2:] - y[:-2])
     size = np.abs(off)
     # The neighbours of a spike are off by half as much.
     beside = np.maximum(np.append(size[1:], 0.0), np.append(0.0, size[:-1]))

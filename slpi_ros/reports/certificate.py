@@ -19,7 +19,7 @@ from slpi_ros.model.stage_model import StageModel, seconds_since
 from slpi_ros.model.uncertainty import COMPONENTS, COVERAGE_FACTOR, AxisUncertainty
 from slpi_ros.reports.page import Page
 from slpi_ros.reports.uncertainty import PLACES, TIMES, uncertainty_document
-from slpi_ros.reports.verification import SEVERITY, record_notes
+from slpi_ros.reports.verification import SEVERITY, part_judged, record_notes
 from slpi_ros.verification.verify import RecordVerification, counted
 from slpi_ros.workflows.verify import VerifyOutcome
 
@@ -50,6 +50,7 @@ def certificate(done: VerifyOutcome, bags: Sequence[str], model: StageModel, mod
         "issued": datetime.now(UTC).isoformat(timespec="seconds"),
         "verdict": found.verdict,
         "tolerance_m": found.tolerance,
+        **found.given,
         "method": list(METHOD),
         "model": {"source": model_file, "sha256": digest, "created": model.created},
         "records": [
@@ -91,6 +92,7 @@ def write_files(folder: Path, document: dict[str, Any]) -> None:
             "tolerance of the rms error": length(document["tolerance_m"])
             if document["tolerance_m"]
             else "none given; the limit of each record is in the table of its errors",
+            "judged of each record": part_judged(document["start_s"], document["stop_s"]),
         }
     )
     page.contents(tuple(document["axes"]))

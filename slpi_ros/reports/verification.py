@@ -35,6 +35,11 @@ _FEWEST_SIZES = 3
 # Largest number of times that are told.
 MOST_TIMES = 3
 LINES, ZERO = "line interference or vibration", "the zero"
+# Where the initial state is given.
+GIVEN = {
+    "end": "as at the end of the identified record", "start": "as at the start of the identified record",
+    "wiped": "as after a reset",
+}  # fmt: skip
 FOREIGN = "another stage, or of other units"
 
 
@@ -206,7 +211,8 @@ def _error(record: RecordVerification) -> str:
 
 def _judged_share(record: RecordVerification) -> str:
     """Return how many samples are judged, and why not more."""
-    said = f"{record.error.samples:,} of {record.samples:,} samples judged ({record.share:.0%})"
+    part = f" {part_judged(*record.span)}" if record.is_part else ""
+    said = f"{record.error.samples:,} of {record.samples:,} samples{part} judged ({record.share:.0%})"
     if record.share >= verify.MOST_KNOWN:
         return said
     if record.unusable > (1.0 - record.share) / 2:
@@ -220,12 +226,16 @@ def _judged_share(record: RecordVerification) -> str:
 
 def record_notes(record: RecordVerification) -> list[str]:
     """Return the assumptions about a record's initial state, and findings other than the error."""
-    if record.known_from is None:
+    if record.start_memory:
+        notes = [f"the initial state is given: {GIVEN[record.start_memory]} (--start-memory {record.start_memory})"]
+    elif record.known_from is None:
         notes = ["the initial state is unknown: it is estimated from the record"]
     elif record.begins_known:
         notes = ["the initial state is known"]
     else:
         notes = [f"the initial state is known from {record.known_from:.4g} s on, but for a constant"]
+    if record.is_part:
+        notes.append(f"only a part of the record was to be judged: {part_judged(*record.span)}")
     if not record.begins_known:
         notes.append(f"the unknown initial state makes the constant uncertain by {length(record.offset_uncertainty)}")
     if record.moving and record.standing:
@@ -246,6 +256,14 @@ def record_notes(record: RecordVerification) -> list[str]:
     if record.beyond:
         notes.append(f"{record.beyond}: the model extrapolates there")
     return notes
+
+
+def part_judged(start: float | None, stop: float | None) -> str:
+    """Return which part of each record was to be judged, from `start` to `stop` (s; None: no limit)."""
+    if start is None and stop is None:
+        return "the whole record"
+    begin, end = ("the beginning" if start is None else f"{start:g} s"), ("the end" if stop is None else f"{stop:g} s")
+    return f"from {begin} to {end}"
 
 
 def _tracking_notes(tracking: Tracking) -> list[str]:

@@ -20,6 +20,7 @@ from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.hysteresis.slpi_published import UnidentifiedLoopWarning
 from slpi_ros.identification.cross_validation import level_classes, loop_levels, region_classes, speed_classes
 from slpi_ros.identification.free_run import AS_WELL, Match, match, starts_at_end
+from slpi_ros.identification.held_readings import from_fresh
 from slpi_ros.identification.repeatability import repeatability_of
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.io.record import Record, common_stage
@@ -83,6 +84,8 @@ class RecordVerification:
     independent: bool = True  # the model was not identified from it
     lacking: tuple[str, ...] = ()  # quantities that the model follows and the record does not hold
     holds: tuple[str, ...] = ()  # those that it holds
+    span: tuple[float | None, float | None] = (None, None)  # s, the part that was to be judged; None: no limit
+    start_memory: StartMemory | None = None  # the initial state, as given
 
     @property
     def share(self) -> float:
@@ -93,6 +96,11 @@ class RecordVerification:
     def unusable(self) -> float:
         """Share of the readings that cannot be judged, whatever the initial state is."""
         return 1.0 - float(np.count_nonzero(np.isfinite(self.measured))) / self.samples
+
+    @property
+    def is_part(self) -> bool:
+        """Whether only a part of the record was to be judged."""
+        return self.span != (None, None)
 
     @property
     def unrepeated_rms(self) -> float:
@@ -260,6 +268,12 @@ class Verification:
         """Whether every axis passes."""
         return self.verdict == PASSED
 
+    @property
+    def given(self) -> dict[str, float | str | None]:
+        """What was given of all records, for documents: the part to be judged and the initial state; None: nothing."""
+        one = next(iter(self.axes.values())).records[0]
+        return {"start_s": one.span[0], "stop_s": one.span[1], "start_memory": one.start_memory}
+
     def to_document(self) -> dict[str, Any]:
         """Return the verification document, ``msg_schemas/verification.schema.json``."""
         return {
@@ -268,6 +282,7 @@ class Verification:
             "verdict": self.verdict,
             "passed": self.passed,
             "tolerance_m": self.tolerance,
+            **self.given,
             "axes": {name: axis.to_document() for name, axis in self.axes.items()},
         }
 
@@ -337,11 +352,15 @@ def verify(
     for record, path in zip(records, paths, strict=True):
         # Errors are those of the stage, not those of its sensor.
         surrounded = model.surrounded(record)
-        runs = _free_run(model.correct(record), surrounded.stage_only, names, (start, stop), start_memory)
+        fresh = from_fresh(record, [name for name, axis in model.axes.items() if axis.corrects], model.correct)
+        runs = _free_run(fresh, surrounded.stage_only, names, (start, stop), start_memory)
         for name in names:
             axis, run = surrounded.axis(name), runs[name]
             one = _judge(run, axis, record.source, tolerance, without_offset=without_offset)
-            one = replace(one, independent=record.source not in own, holds=tuple(record.surroundings))
+            one = replace(
+                one, independent=record.source not in own, holds=tuple(record.surroundings), span=(start, stop),
+                start_memory=start_memory,
+            )  # fmt: skip
             if path is not None and name in path:
                 followed = path[name][np.isfinite(record.voltage[name])][: run.t.size]
                 # From a known state nothing but the zero adds a constant.

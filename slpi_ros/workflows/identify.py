@@ -5,9 +5,10 @@ from dataclasses import dataclass, replace
 
 from slpi_ros.identification import fit
 from slpi_ros.identification.cross_validation import CrossValidationReport, cross_validate
+from slpi_ros.identification.held_readings import corrected_fresh
 from slpi_ros.identification.uncertainty import CurveUncertainty, curve_uncertainty, require_known_uncertainty
 from slpi_ros.io.record import Record
-from slpi_ros.model.sensor import IDEAL, Sensor, corrected
+from slpi_ros.model.sensor import IDEAL, Sensor
 from slpi_ros.model.stage_model import StageModel
 from slpi_ros.workflows.records import (
     Findings,
@@ -62,7 +63,7 @@ class IdentifyOutcome:
 
     def _corrected(self, axis: str) -> list[Record]:
         sensor = self.request.sensor
-        return [corrected(record, {axis: sensor.undo}) if sensor else record for record in self.records]
+        return [corrected_fresh(record, {axis: sensor.undo}) if sensor else record for record in self.records]
 
 
 def identify(request: IdentifyRequest) -> IdentifyOutcome:

@@ -9,9 +9,13 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from slpi_ros.diagnosis.prepare import no_cause, uncovered
 from slpi_ros.errors import IdentificationError, ModelError, RecordError, SlpiError, UsageError
+from slpi_ros.identification.held_readings import from_fresh
 from slpi_ros.identification.record_quality import Finding, assess, findings, require_usable
+from slpi_ros.identification.samples import part_of
 from slpi_ros.io.alignment import SeparateTopics
 from slpi_ros.io.bag_files import locate
 from slpi_ros.io.bag_reader import read_bag, require_different, require_one_stage
@@ -60,6 +64,8 @@ class Source:
 
         `stage` is the name that a model gives, if there is one.
         """
+        # In every command a wrong call, before anything is read.
+        part_of(np.empty(0), self.start, self.stop)
         if self.records:
             return tuple(_with_chosen(record, self.surroundings) for record in self.records)
         records = tuple(self._ordered(self.read_bag(str(bag), coupled=coupled)) for bag in require_different(self.bags))
@@ -284,7 +290,7 @@ def _sensed(record: Record, axis: str, sensor: Sensor) -> Record:
         return record
     ends_ns = record.time_ns[-1:] - round(sensor.delay * 1e9)
     told = slice(int((record.time_ns <= ends_ns).sum()))
-    return corrected(record, {axis: sensor.undo}).part(told)
+    return from_fresh(record, [axis], lambda read: corrected(read, {axis: sensor.undo}).part(told))
 
 
 def shared_axes(records: Sequence[Record], model: StageModel, source: Source) -> Sequence[str]:

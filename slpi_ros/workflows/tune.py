@@ -11,10 +11,10 @@ from slpi_ros.compensator.loop_design import MARGIN, Design, design
 from slpi_ros.compensator.loop_margin import ComplexArray, Plant
 from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.identification.frequency_response import FrequencyResponse, frequency_response
-from slpi_ros.io.record import Record
+from slpi_ros.io.record import Record, common_stage
 from slpi_ros.model.axis_model import AxisModel
 from slpi_ros.model.stage_model import StageModel
-from slpi_ros.workflows.records import Source
+from slpi_ros.workflows.records import Source, mismatch_in_data
 
 # Measured lines count for the design where their interval is within this share.
 SURE = 0.2
@@ -45,7 +45,7 @@ def tune(request: TuneRequest) -> TuneOutcome:
     for name in names:
         if name not in model.axes:
             raise UsageError(f"axis '{name}': the model has axes {', '.join(model.axes)}; name one of these")
-    record = request.source.read(stage=model.hardware_id)[0] if request.source else None
+    record = _record(request.source, model) if request.source else None
     designs, responses = {}, {}
     for name in names:
         axis = model.axes[name]
@@ -58,6 +58,14 @@ def tune(request: TuneRequest) -> TuneOutcome:
         if measured:
             responses[name] = measured
     return TuneOutcome(designs, responses)
+
+
+def _record(source: Source, model: StageModel) -> Record:
+    """Return the record; ModelError if it is of another stage than the model."""
+    record = source.read(stage=model.hardware_id)[0]
+    with mismatch_in_data():
+        common_stage([record], model.hardware_id)
+    return record
 
 
 def _measured(record: Record | None, name: str) -> FrequencyResponse | None:

@@ -1,5 +1,7 @@
 """The drive for the frequency response, and what is found of it in a record."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -100,8 +102,6 @@ def test_a_record_without_the_drive_is_refused():
 
 
 def test_effects_of_the_model_are_those_of_the_plant():
-    from dataclasses import replace
-
     from strategies import PI_CASE, axis_model
 
     from slpi_ros.compensator.loop_margin import Plant
@@ -109,3 +109,46 @@ def test_effects_of_the_model_are_those_of_the_plant():
     axis = replace(axis_model(PI_CASE), effects=(Delay(DELAY), Resonance((Mode(MODE, DAMPING, 1.0),))))
     plant, frequency = Plant.of(axis), np.geomspace(1.0, 300.0, 50)
     np.testing.assert_allclose(plant.response(2.0 * np.pi * frequency), plant.slope * truth(frequency), rtol=1e-9)
+
+
+def test_periods_with_a_missing_reading_are_left_out(drive):
+    v = drive.voltage["x"]
+    y = 1e-7 * v
+    size = int(24_000 * 0.9 / (len(BIASES) * PERIODS))
+    near = np.flatnonzero(np.abs(v - 50.0) <= 100.0 * PEAK)
+    gap = y.copy()
+    gap[near[near.size // 2]] = np.nan
+    found, whole = frequency_response(drive.t, v, gap), frequency_response(drive.t, v, y)
+    assert found.frequency.size == whole.frequency.size and found.biases == whole.biases
+    np.testing.assert_allclose(found.response, whole.response, rtol=1e-6)
+    assert np.isfinite(found.interval).all()
+    assert found.agreement(whole.response) == (found.frequency[0], found.frequency[-1])
+    # A bias of which no period is left is left out.
+    lost = np.where(np.abs(v - 25.0) <= 100.0 * PEAK, np.nan, y)
+    assert frequency_response(drive.t, v, lost).biases == whole.biases[1:]
+    gap[:: size // 2] = np.nan
+    with pytest.raises(RecordError, match="^readings are missing in nearly all periods[^\n]+$"):
+        frequency_response(drive.t, v, gap)
+
+
+def test_what_is_not_known_agrees_with_no_model(drive):
+    v = drive.voltage["x"]
+    found = frequency_response(drive.t, v, 1e-7 * v)
+    half = np.where(np.arange(found.frequency.size) < found.frequency.size // 2, found.response, np.nan)
+    band = replace(found, response=half).agreement(found.response)
+    assert band[1] == pytest.approx(found.frequency[found.frequency.size // 2], rel=0.05)
+    unsure = replace(found, noise=np.full(found.frequency.size, np.nan))
+    for one, model in ((found, np.nan * found.response), (unsure, found.response)):
+        assert one.agreement(model) is None
+
+
+@pytest.mark.parametrize("size", [0, 1, 2, 3, 60])
+def test_a_record_that_is_too_short_is_refused(size):
+    t = np.arange(size) / RATE
+    with pytest.raises(RecordError, match="--for-response"):
+        frequency_response(t, np.sin(t), np.sin(t))
+
+
+def test_a_negative_seed_is_refused():
+    with pytest.raises(UsageError, match="seed -1"):
+        response_drive(("x",), 0.0, 100.0, 1000.0, 24.0, RATE, seed=-1)

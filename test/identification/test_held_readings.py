@@ -1,14 +1,20 @@
 """A sensor slower than its record: recognised from the data, at its rate, and only its fresh readings are used."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from refusals import holds
 
 import slpi_ros
+from slpi_ros.effects.creep import Creep
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.identification.held_readings import held_readings, without_held
+from slpi_ros.identification.refit import refit
 from slpi_ros.io.record import Record
+from slpi_ros.model.sensor import Sensor
+from slpi_ros.workflows.records import Source, assess_record
 
 RADII = np.linspace(0.0, 40.0, 12)
 STAGE = PrandtlIshlinskii(RADII, np.concatenate([[1e-7], 6e-8 * np.exp(-RADII[1:] / 15.0)]))
@@ -166,3 +172,69 @@ def test_the_error_on_a_clean_record_is_that_of_the_fresh_readings(rate, seconds
     for rows in (1, 2, 3, 5, 10, 20):
         shown, new = held(rng, y, rows, jitter) if rows > 1 else (y, np.ones(y.size, dtype=bool))
         assert error(shown) <= 1.1 * error(np.where(new, shown, np.nan)), rows
+
+
+@pytest.mark.parametrize("jitter", [0.0, 2e-5])
+@pytest.mark.parametrize("sensor", [Sensor(0.002), Sensor(0.0, 5e-4), Sensor(0.0023, 0.005)])
+def test_held_readings_of_a_sensor_whose_timing_is_known(sensor, jitter):
+    """Without delay and lag readings that were equal are not: they are recognised before, and told after."""
+    rng = np.random.default_rng(10)
+    t, v = drive(rng, 1000, 12.0)
+    t = t + rng.uniform(0.0, jitter, t.size)
+    y, new = held(rng, sensor.apply(t, readings(rng, v, 0.0, 0.0)) + rng.normal(0.0, 8e-9, t.size), 5, jitter=False)
+    shown, fresh = record(t, v, y), record(t, v, np.where(new, y, np.nan))
+    assessed = assess_record(shown, Source(records=[shown]), {"x": sensor})
+    (plain,) = (one.text for one in assess_record(shown, Source(records=[shown])).findings["x"] if "slower" in one.text)
+    texts = [one.text for one in assessed.findings["x"]]
+    assert plain in texts and holds(plain, 5, 200) and not any("missing" in text for text in texts)
+    known = {"sensor_delay": sensor.delay, "sensor_lag": sensor.lag}
+    models = [slpi_ros.identify(each, **known) for each in (shown, fresh)]
+    fitted = [model.axes["x"].quality for model in models]
+    assert fitted[0].samples == pytest.approx(np.count_nonzero(new), rel=0.02) == fitted[1].samples
+    assert fitted[0].rms == pytest.approx(fitted[1].rms, rel=1e-6)
+    # Of a record in which no reading is held the model is as good.
+    t2, v2 = drive(rng, 1000, 5.0)
+    clean = sensor.apply(t2, readings(rng, v2, 0.0, 0.0)) + rng.normal(0.0, 8e-9, t2.size)
+    (one,) = slpi_ros.verify(record(t2, v2, clean), models[0]).axes["x"].records
+    assert one.rest.rms < 4e-8
+    # All fresh readings are judged, of all that there are, and none counts as missing.
+    (judged,) = slpi_ros.verify(shown, models[0]).axes["x"].records
+    assert judged.error.samples == pytest.approx(np.count_nonzero(new), rel=0.02) and 0.95 <= judged.share <= 1.0
+    assert judged.unusable < 0.02
+    _, changes = refit(models[0], shown)
+    assert not changes["x"].drifted
+
+
+@pytest.mark.long
+def test_a_diagnosis_of_held_readings_of_a_late_sensor_is_one_of_the_fresh_ones():
+    rng = np.random.default_rng(10)
+    t, v = drive(rng, 1000, 12.0)
+    y, new = held(rng, Sensor(0.0, 5e-4).apply(t, readings(rng, v, 0.0, 0.0)) + rng.normal(0.0, 8e-9, t.size), 5, False)
+    model = slpi_ros.identify(record(t, v, y), sensor_lag=5e-4)
+    diagnosed = slpi_ros.diagnose(record(t, v, y), model).extended.axes["x"]
+    assert diagnosed.quality.samples == pytest.approx(np.count_nonzero(new), rel=0.02)
+
+
+def test_held_readings_are_left_out_of_a_refit_of_a_model_with_effects():
+    rng = np.random.default_rng(13)
+    t, v = drive(rng, 1000, 12.0)
+    y, new = held(rng, readings(rng, v, 8e-9, 0.0), 5, jitter=False)
+    model = slpi_ros.identify(record(t, v, y))
+    x = replace(model.axes["x"], effects=(Creep((2.0,), (0.01,)),))
+    again, _ = refit(replace(model, axes={"x": x}), record(t, v, y))
+    added = again.axes["x"].quality.samples - x.quality.samples
+    assert added <= np.count_nonzero(new)
+
+
+def test_slopes_of_held_readings_are_not_spoilt_by_one_of_them():
+    """The neighbours of an outlier are as before, and so are missing readings."""
+    t = np.arange(4000) * 1e-3
+    x = 5e-6 * (1.0 - np.cos(2.0 * np.pi * t))
+    sensor = Sensor(0.0, 0.005)
+    y = sensor.apply(t, x)
+    y[np.arange(t.size) % 5 != 0] = np.nan
+    y[2000] += 1e-6
+    back = sensor.undo(t, y)
+    assert np.array_equal(np.isnan(back), np.isnan(y)) and back[2000] - x[2000] == pytest.approx(1e-6, rel=0.05)
+    others = np.isfinite(y) & (np.arange(t.size) != 2000)
+    np.testing.assert_allclose(back[others], x[others], rtol=0, atol=1e-8)

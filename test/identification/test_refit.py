@@ -9,10 +9,12 @@ from identification.records import calibration, record_of, rms, stage
 import slpi_ros
 from benchmarks.paths import scan_path
 from slpi_ros.effects.creep import Creep
+from slpi_ros.effects.cross_coupling import CrossCoupling
 from slpi_ros.effects.lag import Lag
 from slpi_ros.errors import IdentificationError, UsageError
 from slpi_ros.excitation.drives import calibration_drive
 from slpi_ros.identification.refit import refit
+from slpi_ros.io.record import Record
 from slpi_ros.model.document import format_model, parse_model
 from slpi_ros.simulation.axis import SimulatedAxis
 
@@ -138,3 +140,22 @@ def test_a_voltage_slightly_beyond_the_range_is_held_at_its_end(model, excess):
     assert not changes["x"].drifted
     assert new.axes["x"].voltage_range == (low, high)
     assert unseen_error(new, 1.0) < 1.1 * unseen_error(within, 1.0)
+
+
+def test_coupling_of_an_axis_that_is_not_updated_is_not_taken_for_hysteresis(model):
+    """2 % of another axis, which moves by its whole stroke meanwhile, is 0.4 µm."""
+    x = model.axes["x"]
+    both = replace(model, axes={"x": replace(x, effects=(CrossCoupling({"y": 0.02}),)), "y": x})
+    t, v = calibration_drive(0.0, 100.0, duration=15.0, rate=200.0, seed=3)
+    _, other = calibration_drive(0.0, 100.0, duration=15.0, rate=200.0, seed=4)
+    volts = {"x": v, "y": other}
+    noise = 8e-9 * np.random.default_rng(0).normal(size=(2, t.size))
+    moved = dict(zip("xy", np.array([both.simulate(t, volts)[name] for name in "xy"]) + noise, strict=True))
+    assert 0.02 * np.ptp(moved["y"]) > 3e-7
+    record = Record(np.round(t * 1e9).astype(np.int64), volts, moved, "test")
+    new, changes = refit(both, record, axes=["x"])
+    assert set(changes) == {"x"} and new.axes["y"] is both.axes["y"]
+    assert not changes["x"].drifted and changes["x"].error_after < 9e-9
+    # Without voltages of the other axis nothing is known of its motion.
+    unknown = replace(record, voltage={"x": v, "y": np.full(t.size, np.nan)})
+    assert refit(both, unknown, axes=["x"])[1]["x"].error_before > 5e-8

@@ -25,6 +25,7 @@ from slpi_ros.reports.verification import FILES, describe_verification
 from slpi_ros.workflows.verify import VerifyOutcome
 
 NOISE = 8e-9
+GIVEN = "start_s", "stop_s", "start_memory"
 BEGINS = datetime(2026, 5, 6, 7, 8, 9, tzinfo=UTC)
 
 
@@ -125,6 +126,35 @@ def test_the_headline_names_the_error_that_is_judged(options, named, code, folde
     judged = length(one[one["limit_of"]])
     assert named in head.split(" rms")[0] and f"{judged} rms" in head and f"limit {length(one['limit_m'])}" in head
     assert ("no tolerance for it was given" in head) == (code == 0) and length(one["rms_m"]) in head
+
+
+@pytest.mark.parametrize(
+    ("options", "given", "told"),
+    [
+        (("--start", "12"), (12.0, None, None), "from 12 s to the end"),
+        (("--stop", "9.5", "--start-memory", "start"), (None, 9.5, "start"), "from the beginning to 9.5 s"),
+        ((), (None, None, None), "the whole record"),
+    ],
+)
+def test_a_part_and_an_initial_state_that_were_given_are_told(options, given, told, folder, verify):
+    code, said, _ = verify("--model", "model.json", "--tolerance", "0.05", "--certificate", "-o", "part", *options)
+    assert code == 0
+    documents = [json.loads((folder / "part" / name).read_text()) for name in ("certificate.json", FILES[0])]
+    for document, name in zip(documents, ("certificate", "verification"), strict=True):
+        assert (document["start_s"], document["stop_s"], document["start_memory"]) == given
+        validate(document, name, "test")
+        # Those of an earlier version do not say it.
+        validate({key: one for key, one in document.items() if key not in GIVEN}, name, "test")
+    (remarks,) = (one["remarks"] for one in documents[0]["axes"]["x"]["errors"])
+    pages = [(folder / "part" / name).read_text() for name in ("certificate.html", FILES[1])]
+    assert told in pages[0]
+    if given[:2] != (None, None):
+        assert f"samples {told} judged" in said
+        assert any(told in remark for remark in remarks) and all(told in page for page in pages)
+    assert ("the initial state is known" in remarks) == (given[2] is None)
+    assert any(remark.startswith("the initial state is given") and "start" in remark for remark in remarks) == (
+        given[2] is not None
+    )
 
 
 @pytest.mark.parametrize("recorded", [True, False])

@@ -45,7 +45,7 @@ def run(options: Namespace) -> Result:
 
     common.require_another_file(options.output, options.model, options.table)
     model = load_model(options.model)
-    t, desired, surroundings = read_table_with(options.table, "m", model.quantities)
+    t, desired, surroundings = read_table_with(options.table, "m", model.quantities, model.axes)
     check_time(t)
     known = common.model_columns(desired, model, options.table)
     options.remarks += allow_table(options.output, table_header(known, "V"), overwrite=options.overwrite)

@@ -66,7 +66,7 @@ def run(options: Namespace) -> Result:
     before = read_learned(options.learned) if options.learned and Path(options.learned).exists() else None
     desired = None
     if options.desired:
-        t, columns = read_table(options.desired, "m")
+        t, columns = read_table(options.desired, "m", model.axes)
         desired = t, common.model_columns(columns, model, options.desired)
     limit = None if options.learn_limit is None else 1e-6 * options.learn_limit
     file = options.learned or ""

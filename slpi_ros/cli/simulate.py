@@ -28,7 +28,7 @@ def run(options: Namespace) -> Result:
 
     common.require_another_file(options.output, options.model, options.table)
     model = load_model(options.model)
-    t, voltage, surroundings = read_table_with(options.table, "V", model.quantities)
+    t, voltage, surroundings = read_table_with(options.table, "V", model.quantities, model.axes)
     known = common.model_columns(voltage, model, options.table)
     options.remarks += allow_table(options.output, table_header(known, "m"), overwrite=options.overwrite)
     options.remarks += common.quantities_beyond(model, t, surroundings)

@@ -365,7 +365,7 @@ class Axis:
     def measure(self, displacement: float, now_ns: int, fresh: bool = True, age: float = 0.0) -> None:
         """Take a reading (m) of an `age` (s), `fresh`: stamped now; RejectedError if it is implausible.
 
-        What is older than the timeout of the feedback is no reading: to model and feedback the sensor is silent.
+        To feedback that is on, what is older than its timeout is no reading: its sensor is silent.
         """
         if self.model is None:
             return
@@ -378,8 +378,9 @@ class Axis:
             if fresh:
                 self.initial.read(x, now_ns)
             return
-        if age > self.loop.settings.timeout:
-            self.loop.sensor.stale = age
+        late = self.loop.settings.enabled and age > self.loop.settings.timeout
+        self.loop.sensor.stale = age if late else 0.0
+        if late:
             return
         if not self.loop.follows_total:
             self.loop.close(self.stream, self.samples.given_ns)

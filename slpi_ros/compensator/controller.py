@@ -209,8 +209,12 @@ class Controller:
         saved: Mapping[str, SavedAxis] | None = None,
         start_memory: StartMemory = "end",
         last_voltages: Mapping[str, float] | None = None,
+        now_ns: int = 0,
     ) -> None:
-        """Replace the model in use, or raise and keep the old one; the voltages are unchanged."""
+        """Replace the model in use, or raise and keep the old one; the voltages are unchanged.
+
+        A trajectory that the new model does not accept is canceled, as by a command at `now_ns`.
+        """
         # Only the first model uses what was saved; `last_voltages` (V) are of axes saved with another model.
         stage = self.ownership.stage
         if why := stage.difference(model=model.hardware_id):
@@ -249,9 +253,13 @@ class Controller:
         if self.trajectory.recheck({axis.name: axis.stream.accepted for axis in self.axes}):
             # As at its end: each axis holds its last setpoint, or stays where it is if that is not accepted either.
             self.stopped = StopReason.CANCELED
+            self.watchdog.feed(now_ns)
             for axis in self.axes:
                 axis.samples.restart()
                 axis.use_checked(False)
+                if axis.motion.follows and axis.motion.due_ns is None:
+                    # It has waited for the next sample.
+                    axis.motion.due_ns = now_ns
 
     def set_zero(self, now_ns: int) -> dict[str, float | None]:
         """Let the models agree with the sensors now; return by how much (m) each zero moves, None: not measured."""

@@ -101,7 +101,6 @@ class SensorRule(Rule):
         """Take a reading (m), and the displacement of the model (m) at that time."""
         if self._silence:
             self._silence.hear(now_ns)
-        self.stale = 0.0
         self._readings.append(now_ns, expected, reading)
 
     def check(self, now_ns: int) -> Finding | None:

@@ -141,10 +141,11 @@ def desired_of(path: str | os.PathLike[str], record: Record, topic: str | None =
 def read_path(path: str | os.PathLike[str], axes: Sequence[str] = ()) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Return times from 0 (s) and desired displacements (m), (N,), of a table ``time_s,<axis>_m`` or of a bag.
 
-    `axes`: names of columns without names; default ``x``. RecordError if there is no path, or it cannot be read.
+    `axes`: names of columns without names, default ``x``, and known ones. RecordError if there is no path, or it cannot
+    be read.
     """
     if not (Path(path).is_dir() or Path(path).name.endswith(SUFFIXES)):
-        t, columns = read_table(path, "m")
+        t, columns = read_table(path, "m", axes)
         return t - t[:1], columns
     found = read_desired(path, axes or ("x",))
     if not found:

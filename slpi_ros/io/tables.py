@@ -2,7 +2,7 @@
 
 import csv
 import os
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from io import StringIO
@@ -228,23 +228,28 @@ def _column_summary(column: Column, values: FloatArray, unit: str) -> str:
     return f"{column.name} {known.min():.5g} to {known.max():.5g} {unit}{assumed}"
 
 
-def read_table(path: str | os.PathLike[str], suffix: str) -> tuple[FloatArray, dict[str, FloatArray]]:
+def read_table(
+    path: str | os.PathLike[str], suffix: str, axes: Collection[str] = ()
+) -> tuple[FloatArray, dict[str, FloatArray]]:
     """Read times (s) and finite values (V or m) by axis, shape (N,) each, from a table of the command line."""
-    t, by_axis, _ = read_table_with(path, suffix, ())
+    t, by_axis, _ = read_table_with(path, suffix, (), axes)
     return t, by_axis
 
 
 def read_table_with(
-    path: str | os.PathLike[str], suffix: str, beside: Sequence[str]
+    path: str | os.PathLike[str], suffix: str, beside: Sequence[str], axes: Collection[str] = ()
 ) -> tuple[FloatArray, dict[str, FloatArray], dict[str, FloatArray]]:
     """Read times (s), finite values (V or m) by axis, and quantities by name, (N,) each, from a table of a command."""
     # The columns are ``time_s``, ``<axis>_<suffix>``, "V" or "m", of an axis without one that in another unit of the
-    # same quantity, as in x_um, and of `beside` those that are there, in any order; others are ignored. A quantity is
-    # held where its cells are empty.
+    # same quantity, as in x_um, and of `beside` those that are there, in any order; others are ignored, also those in
+    # another unit beside one in "V" or "m" if they are not of the known `axes`. A quantity is held where its cells are
+    # empty.
     table = load_table(Path(path))
     ending = _ending(suffix)
     own = [name for name in table.columns if name not in beside]
     columns = _of_each_axis(own, VOLTAGE if suffix == VOLTAGE.default else DISPLACEMENT)
+    if given := {axis: column for axis, column in columns.items() if column[0].endswith(ending)}:
+        columns = {axis: column for axis, column in columns.items() if axis in given or axis in axes}
     if not columns:
         raise RecordError(
             f"{path}: no column <axis>{ending}; there is {table.listing()}; write such names above the columns, or "

@@ -1,5 +1,6 @@
 """The models of a compensator: from a file and from ``stage_model``, validated, and put into use."""
 
+import time
 from concurrent.futures import Future, ThreadPoolExecutor
 
 from rclpy.lifecycle import LifecycleNode
@@ -81,7 +82,7 @@ class Models:
         if controller.model is None or fingerprint != reporter.model_id:
             saved, last = self._memory.find(model)
             try:
-                controller.use_model(model, saved, values["start_memory"], last)
+                controller.use_model(model, saved, values["start_memory"], last, time.monotonic_ns())
             except SlpiError as error:
                 raise ModelError(f"{source}: {error}") from None
             self._node.get_logger().info(

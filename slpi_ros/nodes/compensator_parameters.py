@@ -179,7 +179,7 @@ DECLARATIONS = (
         TIMEOUT,
     ),
     declare.scalar(
-        "measurement_timeout", 0.1, "Seconds; older measurements are ignored and the correction is held.", TIMEOUT,
+        "measurement_timeout", 0.1, "Seconds; feedback holds, and ignores measurements with older stamps.", TIMEOUT,
     ),
     declare.scalar(
         "drift_alarm", 3.0,

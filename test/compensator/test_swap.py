@@ -213,3 +213,16 @@ def test_a_trajectory_that_another_model_does_not_accept_is_canceled(begin_s):
     assert np.abs(advanced(made, now, 3.0) - before).max() < 1e-9
     made.follow(["x"], times, path + 100e-6, 0, now + 4 * 10**9, now + 4 * 10**9)
     assert made.trajectory.on and not made.trajectory.refused
+
+
+def test_what_a_model_cancels_counts_as_a_command():
+    """The axis brakes by itself, and the time without a command counts from there."""
+    made, now = held()
+    times = np.arange(1, 500) * 4 * MS
+    made.follow(["x"], times, (10e-6 + np.linspace(0.0, 2e-6, 499))[:, None], now, now, now)
+    advanced(made, now, 0.1)
+    now += 10**8
+    made.axes[0].motion.due_ns = None  # as between two samples
+    made.use_model(StageModel({"x": AXIS.shifted(100e-6)}), now_ns=now)
+    assert made.axes[0].motion.due_ns == now
+    assert made.watchdog.silence(now) == 0.0

@@ -128,7 +128,7 @@ class TestADeviceThatPlaysBlocks:
     def test_a_whole_drive_ends_as_the_driver_says(self, bench):
         blocks = bench.graph.record(JointTrajectory, "voltage_trajectory")
         with bench.exciting(drive="sweep", duration=3.0) as node:
-            assert bench.end_of(node) == 0
+            assert bench.end_of(node) == 0, node.stderr
             assert "done after" in node.stderr and "confirmed" not in node.stderr
         (block,) = blocks
         age = time.time() - block.header.stamp.sec - block.header.stamp.nanosec * 1e-9

@@ -307,18 +307,23 @@ def _examined(t: FloatArray, v: FloatArray, y: FloatArray, fitted: Mask, where: 
     return Samples(smooth, y, fitted, mixed=mixed.readings.size, side=mixed.side, held=max(held.rows, rows))
 
 
-def part_of(t: FloatArray, start: float | None, stop: float | None) -> tuple[int, int]:
-    """Return indices ``first:until`` of ``start <= t < stop`` (s) in ordered times; UsageError unless start < stop."""
+def ends_of(start: float | None, stop: float | None) -> tuple[float, float]:
+    """Return the ends (s) of a part of a record, infinite where None; UsageError unless start < stop."""
     low, high = -np.inf if start is None else start, np.inf if stop is None else stop
     if not low < high:
         raise UsageError(f"start {start} s is not before stop {stop} s; give seconds from the first stamp, in order")
+    return low, high
+
+
+def part_of(t: FloatArray, start: float | None, stop: float | None) -> tuple[int, int]:
+    """Return indices ``first:until`` of ``start <= t < stop`` (s) in ordered times; UsageError unless start < stop."""
+    low, high = ends_of(start, stop)
     return int(np.searchsorted(t, low)), int(np.searchsorted(t, high))
 
 
 def bounds(record: Record, start: float | None, stop: float | None) -> tuple[int, int]:
     """Return `part_of` for a record with ordered stamps, without its times as an array."""
-    part_of(np.empty(0), start, stop)
-    low, high = -np.inf if start is None else start, np.inf if stop is None else stop
+    low, high = ends_of(start, stop)
     origin = int(record.time_ns[0])
     first, until = (
         bisect_left(record.time_ns, at, key=lambda stamp: (int(stamp) - origin) * 1e-9) for at in (low, high)

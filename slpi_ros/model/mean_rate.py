@@ -5,6 +5,7 @@ is 2 f Vpp, and the average current of a data sheet, f C Vpp, half of C times th
 """
 
 from collections import deque
+from collections.abc import Callable
 from itertools import takewhile
 
 import numpy as np
@@ -98,10 +99,7 @@ def slower_by(t: FloatArray, v: FloatArray, limit: float) -> float:
     low, high = 1.0, 2.0
     while too_fast(high):
         low, high = high, 2.0 * high
-    for _ in range(HALVINGS):
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if too_fast(middle) else (low, middle)
-    return high
+    return _bisected(low, high, too_fast)
 
 
 def later_by(before: Travelled, now_ns: int, t: FloatArray, v: FloatArray, limit: float) -> float:
@@ -125,7 +123,11 @@ def later_by(before: Travelled, now_ns: int, t: FloatArray, v: FloatArray, limit
 
     if not too_fast(0.0):
         return 0.0
-    low, high = 0.0, window
+    return _bisected(0.0, window, too_fast)
+
+
+def _bisected(low: float, high: float, too_fast: Callable[[float], bool]) -> float:
+    """Return the least number that is not too fast, between `low`, which is, and `high`, which is not."""
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
         low, high = (middle, high) if too_fast(middle) else (low, middle)

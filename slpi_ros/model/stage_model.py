@@ -1,7 +1,7 @@
 """Model of a stage: the models of all axes and their cross-coupling."""
 
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -178,7 +178,12 @@ class StageModel:
 
         See `AxisModel.correct`; axes that are not in the model, or not in the record, are unchanged.
         """
-        return corrected(record, {name: axis.correct for name, axis in self.axes.items() if axis.corrects})
+        return corrected(record, self.corrections)
+
+    @property
+    def corrections(self) -> dict[str, Callable[[FloatArray, FloatArray], FloatArray]]:
+        """What `correct` does to the times (s) and readings (m) of each axis whose sensor errors are known."""
+        return {name: axis.correct for name, axis in self.axes.items() if axis.corrects}
 
     @property
     def quantities(self) -> tuple[str, ...]:

@@ -8,7 +8,7 @@ import numpy as np
 from slpi_ros.arrays import FloatArray, Mask
 from slpi_ros.errors import SlpiError, length
 from slpi_ros.identification.cross_validation import CLASSICAL, CrossValidationReport, Slice
-from slpi_ros.identification.held_readings import from_fresh
+from slpi_ros.identification.held_readings import corrected_fresh
 from slpi_ros.identification.record_quality import Finding, assess, findings
 from slpi_ros.io.record import Record
 from slpi_ros.model.axis_model import ABOVE_NOISE, AxisModel
@@ -41,7 +41,7 @@ def write_report(
     for name in model.axes:
         record.require_axis(name)
     # What is known of the sensor is taken out: errors are those of the stage.
-    record = from_fresh(record, [name for name, axis in model.axes.items() if axis.corrects], model.correct)
+    record = corrected_fresh(record, model.corrections)
     driven = np.logical_and.reduce([np.isfinite(record.voltage[name]) for name in model.axes])
     t = record.t[driven]
     fitted = (t >= (-np.inf if start is None else start)) & (t < (np.inf if stop is None else stop))

@@ -20,7 +20,7 @@ from slpi_ros.errors import SlpiError, UsageError
 from slpi_ros.hysteresis.slpi_published import UnidentifiedLoopWarning
 from slpi_ros.identification.cross_validation import level_classes, loop_levels, region_classes, speed_classes
 from slpi_ros.identification.free_run import AS_WELL, Match, match, starts_at_end
-from slpi_ros.identification.held_readings import from_fresh
+from slpi_ros.identification.held_readings import corrected_fresh
 from slpi_ros.identification.repeatability import repeatability_of
 from slpi_ros.identification.samples import FEWEST, Samples, select_samples
 from slpi_ros.io.record import Record, common_stage
@@ -352,7 +352,7 @@ def verify(
     for record, path in zip(records, paths, strict=True):
         # Errors are those of the stage, not those of its sensor.
         surrounded = model.surrounded(record)
-        fresh = from_fresh(record, [name for name, axis in model.axes.items() if axis.corrects], model.correct)
+        fresh = corrected_fresh(record, model.corrections)
         runs = _free_run(fresh, surrounded.stage_only, names, (start, stop), start_memory)
         for name in names:
             axis, run = surrounded.axis(name), runs[name]

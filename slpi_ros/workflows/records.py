@@ -9,13 +9,11 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from slpi_ros.diagnosis.prepare import no_cause, uncovered
 from slpi_ros.errors import IdentificationError, ModelError, RecordError, SlpiError, UsageError
 from slpi_ros.identification.held_readings import from_fresh
 from slpi_ros.identification.record_quality import Finding, assess, findings, require_usable
-from slpi_ros.identification.samples import part_of
+from slpi_ros.identification.samples import ends_of
 from slpi_ros.io.alignment import SeparateTopics
 from slpi_ros.io.bag_files import locate
 from slpi_ros.io.bag_reader import read_bag, require_different, require_one_stage
@@ -65,7 +63,7 @@ class Source:
         `stage` is the name that a model gives, if there is one.
         """
         # In every command a wrong call, before anything is read.
-        part_of(np.empty(0), self.start, self.stop)
+        ends_of(self.start, self.stop)
         if self.records:
             return tuple(_with_chosen(record, self.surroundings) for record in self.records)
         records = tuple(self._ordered(self.read_bag(str(bag), coupled=coupled)) for bag in require_different(self.bags))

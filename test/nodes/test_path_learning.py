@@ -1,6 +1,5 @@
 """The process that learns: what is known comes back, also after the process has died; without ROS."""
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -8,36 +7,25 @@ import pytest
 from compensator.test_path_passes import MS, START, axis
 from identification.records import calibration
 from learning.test_learner import RATE, Stage, path
+from learning.test_learning_process import Learning as ForgettingLearning
 
 import slpi_ros
-from slpi_ros.compensator.controller import Controller
-from slpi_ros.model.limits import Limits
-from slpi_ros.nodes.path_learning import PathLearning
 
 pytestmark = pytest.mark.long
 PERIOD = 1.0 / RATE
 
 
-class Learning(PathLearning):
+class Learning(ForgettingLearning):
     """Sends the passes of one path through a simulated stage."""
 
     def __init__(self, model, prefix):
-        self.forgotten = []
-        controller = Controller(["x"], [Limits(0.0, 100.0)], period=PERIOD)
-        super().__init__(controller, prefix, self.forgotten.append)
+        super().__init__(prefix)
         self.use("on", None, 0.0)
         self.use_model(model)
         self.settle()
         t, self.desired = path()
         self._times = np.round(1e9 * t).astype(np.int64)
         self._stage, self._at = Stage(self.desired[0]), START
-
-    def settle(self):
-        deadline = time.monotonic() + 60.0
-        while self.waiting:
-            assert time.monotonic() < deadline
-            self.poll(0)
-            time.sleep(0.01)
 
     def passes_of(self, count):
         """Return the true errors (m) of so many passes."""

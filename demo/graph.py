@@ -63,7 +63,7 @@ class Operator(Node):
         super().__init__("operator")
         self.voltage = self.create_publisher(Float64MultiArray, "voltage_command", QOS)
         self.desired = self.create_publisher(JointState, "desired_displacement", QOS)
-        self._answers: list[tuple[float, float]] = []
+        self._answers: list[tuple[float, float]] = []  # V and m, since the last message
         self.late: list[int] = []  # messages of the last path
         self.state = JointState()
         self.create_subscription(JointState, "stage_state", self._keep, QOS)
@@ -112,6 +112,14 @@ class Operator(Node):
         self.wait_until(f"the answer of {name}", answer.done)
         if not answer.result().success:
             raise SystemExit(f"demo: {answer.result().message}")
+
+    def reset(self) -> tuple[float, float]:
+        """Let the compensator reset memory and zero; return what the stage reached from its first turn on, (m, m)."""
+        self._answers.clear()
+        self.call("/compensator/reset_memory")
+        self.call("/compensator/set_zero")
+        y = np.array(self._answers)[:, 1]
+        return float(y[y.argmax() :].min()), float(y.max())
 
     def drive(self, voltages: Sequence[float], rate: float) -> FloatArray:
         """Apply voltages (V) one after the other; return voltage and measured displacement, shape (N, 2), V and m."""

@@ -13,7 +13,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 
@@ -98,14 +98,15 @@ def follow_uncompensated(stage: Operator, t: FloatArray, y: FloatArray, low: flo
     return plots.Run("uncompensated", t, y, stage.drive(v.tolist(), RATE)[:, 1])
 
 
-def follow_compensated(stage: Operator, name: str, model: Path, t: FloatArray, y: FloatArray) -> plots.Run:
-    """Follow a path with the compensator in between."""
+def follow_compensated(
+    stage: Operator, name: str, model: Path, scan: Callable[[float, float], tuple[FloatArray, FloatArray]]
+) -> plots.Run:
+    """Follow a path, which `scan` returns for what can be reached (m), with the compensator in between."""
     limits = {"voltage_min": V_MIN, "voltage_max": V_MAX}
     with executable("compensator", SENSOR, log="error", model_file=str(model), **limits):
         stage.await_compensator()
         # As the calibrator does: the memory is reset, and the zero is that of the sweep.
-        stage.call("/compensator/reset_memory")
-        stage.call("/compensator/set_zero")
+        t, y = scan(*stage.reset())
         # To the begin of the path without a jump, from where the reset has left the stage.
         at = float(stage.state.position[0])
         approach = at + (y[0] - at) * (1 - np.cos(np.linspace(0.0, np.pi, int(RATE)))) / 2
@@ -120,14 +121,17 @@ def compared(seed: int, models: Mapping[str, Path], duration: float, warm_up: fl
     """Follow a path that no record holds, without and with each model, on the next day, after `warm_up` (s)."""
     with stage_simulator(seed, 1.0, warm_up), operator() as stage:
         stage.wait_until("the stage to be ready", lambda: stage.voltage.get_subscription_count() >= 1)
-        low, high = wipe(stage)
-        bottom, top = low + MARGIN * (high - low), high - MARGIN * (high - low)
-        t, y = scan_path(bottom, top, duration=duration, rate=RATE, seed=seed)
+        paths: list[tuple[FloatArray, FloatArray]] = []
+
+        def scan(low: float, high: float) -> tuple[FloatArray, FloatArray]:
+            margin = MARGIN * (high - low)
+            paths.append(scan_path(low + margin, high - margin, duration=duration, rate=RATE, seed=seed))
+            return paths[0]
+
         # First that of which the calibrator has told the error: from rest, as then. A stage that has moved creeps less.
-        order = reversed(models.items())
-        runs = {name: follow_compensated(stage, name, model, t, y) for name, model in order}
-        wipe(stage)
-        return [follow_uncompensated(stage, t, y, low, high), *(runs[name] for name in models)]
+        runs = {name: follow_compensated(stage, name, model, scan) for name, model in reversed(models.items())}
+        low, high = wipe(stage)
+        return [follow_uncompensated(stage, *paths[0], low, high), *(runs[name] for name in models)]
 
 
 def table_of(runs: Sequence[plots.Run], stroke: float) -> list[list[str]]:

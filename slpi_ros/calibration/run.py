@@ -12,6 +12,7 @@ from slpi_ros.calibration.choice import next_drive
 from slpi_ros.calibration.closed_loop import RASTER, AxisLoop, LoopResult, loops_of, moving, showing, too_slow
 from slpi_ros.calibration.drives import LONGEST_PAUSE, SWEEP_SECONDS, checking, compensated, driven_so_far, exciting
 from slpi_ros.calibration.kept import FOLLOWS, naming, require_kept
+from slpi_ros.calibration.session import Session
 from slpi_ros.calibration.settings import CALIBRATION, CalibrationSettings
 from slpi_ros.compensator.loop_design import design
 from slpi_ros.compensator.plausible import implausible_noise, implausible_stroke
@@ -184,6 +185,7 @@ class _Calibration:
         self._records: list[Record] = []
         # Record of the check.
         self._first: Record | None = None
+        self._session = Session()
         self._drives: list[tuple[str, Sequence[str]]] = []
         # Repeatability of each axis, metres, best known so far: what a diagnosis explains is no noise.
         self._repeatability: dict[str, float] = {}
@@ -278,6 +280,7 @@ class _Calibration:
         recording = self._record(Request(name, drive, desired, loops or {}))
         self._ended = self._clock()
         self._beside = max(self._ended - asked - float(drive.t[-1]), 0.0)
+        recording = replace(recording, record=self._session.following(recording.record, kept=recording.kept))
         if recording.kept:
             fitted = kind not in (CHECK_DRIVE, SWEEP, LOOP_DRIVE)
             require_kept(recording.record, drive, self._settings, self._first, fitted=fitted)

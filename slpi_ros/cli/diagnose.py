@@ -26,6 +26,12 @@ def add_options(command: ArgumentParser) -> None:
         command, "every temperature, humidity, pressure, force, number and other stage of the bag, each by itself"
     )
     common.add_span(command)
+    command.add_argument(
+        "--session",
+        action="store_true",
+        help="the bags are of one session: between them nothing has moved the stage, which still creeps from the one "
+        "to the next (default: each record by itself)",
+    )
     common.add_sensor(command)
 
 
@@ -45,7 +51,7 @@ def run(options: Namespace) -> Result:
     # The model is not checked: an extended model may be extended again.
     common.allow_folder(options, options.output, *report.FILES)
     with output_folder(options.output, *report.FILES) as folder:
-        done = diagnose(DiagnoseRequest(source, model, options.model))
+        done = diagnose(DiagnoseRequest(source, model, options.model, options.session))
         diagnosis = done.diagnosis
         report.write_files(folder, diagnosis)
     limits = report.diagnosis_limits(diagnosis)

@@ -21,7 +21,7 @@ from slpi_ros.identification.linear_kinds import SELECTION_SAMPLES, SMOOTHNESS
 from slpi_ros.identification.published_kinds import voltage_dead_band
 from slpi_ros.identification.refit import basis_of
 from slpi_ros.identification.samples import Samples, select_samples
-from slpi_ros.identification.signal_statistics import digit
+from slpi_ros.identification.signal_statistics import digit, without_noise
 from slpi_ros.io.record import Course, Record
 from slpi_ros.io.surroundings import clean, smoothed
 from slpi_ros.model.axis_model import AxisModel
@@ -66,7 +66,7 @@ class Part:
     """Data of one axis from one record, signals and masks of shape (N,)."""
 
     source: str
-    t: FloatArray  # s, from the first stamp
+    t: FloatArray  # s, from the first stamp; before it below 0
     v: FloatArray  # V, as commanded or read
     y: FloatArray  # m
     used: Mask  # in the fit; outliers, drop-outs and an unknown start only drive the hysteresis
@@ -263,7 +263,34 @@ def _readings(
     chosen = np.flatnonzero(kept)[:MOST_SAMPLES]
     v, y, fitted, mixed = samples.v[chosen], samples.y[chosen], samples.fitted[chosen], samples.mixed * chosen.size
     samples = replace(samples, v=v, y=y, fitted=fitted, mixed=mixed // samples.v.size)
-    return t[chosen], samples, {name: y[chosen] for name, y in others.items()}
+    t, others = t[chosen], {name: y[chosen] for name, y in others.items()}
+    for earlier in reversed(record.before):
+        t, samples, others = _after(earlier, record, axis, (t, samples, others))
+    return t, samples, others
+
+
+def _after(
+    earlier: Record, record: Record, axis: str, readings: tuple[FloatArray, Samples, dict[str, FloatArray]]
+) -> tuple[FloatArray, Samples, dict[str, FloatArray]]:
+    """Return readings of a record preceded by the voltages of an earlier record, which are not fitted."""
+    t, samples, others = readings
+    at = (earlier.time_ns - record.time_ns[0]) * 1e-9
+    latest = np.maximum.accumulate(np.insert(at[:-1], 0, -np.inf))
+    driven = np.isfinite(earlier.voltage[axis]) & (at > latest) & (at < t[0])
+    moved = {}
+    for name, y in others.items():
+        read, first = earlier.displacement[name], record.displacement[name]
+        known = np.isfinite(read)
+        before = np.interp(at, at[known], read[known] - first[np.isfinite(first)][0]) if known.any() else 0.0 * at
+        moved[name] = np.concatenate([before[driven], y])
+    nothing = np.zeros(np.count_nonzero(driven))
+    samples = replace(
+        samples,
+        v=np.concatenate([without_noise(at[driven], earlier.voltage[axis][driven]), samples.v]),
+        y=np.concatenate([nothing, samples.y]),
+        fitted=np.concatenate([nothing > 0.0, samples.fitted]),
+    )
+    return np.concatenate([at[driven], t]), samples, moved
 
 
 def no_cause(record: Record, course: Course, begins: float, ends: float) -> str:
@@ -310,7 +337,7 @@ def _at_stamps(record: Record, t: FloatArray) -> dict[str, FloatArray]:
     found = {}
     for key, course in record.surroundings.items():
         at, value = clean(course)
-        if few(at) or uncovered(at, float(t[0]), float(t[-1])):
+        if few(at) or uncovered(at, max(float(t[0]), 0.0), float(t[-1])):
             continue
         if reason := of_stage(record, (at, value)):
             warnings.warn(f"{record.source}: {key} is not used: {reason}", stacklevel=2)
@@ -395,7 +422,8 @@ def _require_enough(read: Sequence[tuple[FloatArray, Samples, dict[str, FloatArr
         raise RecordError(
             f"{count} usable samples are too few to leave some out and judge by them; record {FEWEST_SAMPLES} or more"
         )
-    turns = sum(Runs.of(t, samples.v, _dead_band(samples.v)).turns for t, samples, _ in read)
+    driven = [(t[t >= 0.0], samples.v[t >= 0.0]) for t, samples, _ in read]
+    turns = sum(Runs.of(t, v, _dead_band(v)).turns for t, v in driven)
     if turns < FEWEST_TURNS:
         raise RecordError(
             f"the voltage turns {turns} times: one loop only, and nothing to judge it by; record several loops of "
@@ -432,7 +460,8 @@ def one_speed(evidence: Evidence) -> bool:
 
 def drive_frequency(evidence: Evidence) -> float:
     """Return the single drive frequency (Hz) of all records; 0 if there are several."""
-    found = [frequency_of_moves(part.t, part.v) for part in evidence.parts]
+    own = [(part.t, part.v, part.t >= 0.0) for part in evidence.parts]
+    found = [frequency_of_moves(t[rows], v[rows]) for t, v, rows in own]
     return float(np.median(found)) if max(found) < ALMOST * min(found) else 0.0
 
 
@@ -449,7 +478,7 @@ def excited_frequency(evidence: Evidence) -> float:
     """Return the highest frequency (Hz) that any record excites; see `EXCITED`."""
     found = []
     for part in evidence.parts:
-        grid = np.arange(part.t[0], part.t[-1], usual_step(part.t))
+        grid = np.arange(max(part.t[0], 0.0), part.t[-1], usual_step(part.t))
         rate = np.diff(np.interp(grid, part.t, part.v))
         power = np.cumsum(np.abs(np.fft.rfft(rate * np.hanning(rate.size))) ** 2)
         found.append(np.fft.rfftfreq(rate.size, usual_step(part.t))[np.searchsorted(power, EXCITED * power[-1])])

@@ -42,7 +42,10 @@ LINE_WIDTH = 12
 
 @dataclass(frozen=True)
 class EffectContext:
-    """Time (s) from the first stamp, non-decreasing, and signals other than the input that an effect may depend on."""
+    """Time (s) from the first stamp, non-decreasing, and signals other than the input that an effect may depend on.
+
+    Times below 0 are those before the record, of which only the voltages are known.
+    """
 
     t: FloatArray
     # Displacement (m) of the other axes relative to their start, before coupling.
@@ -61,8 +64,8 @@ class EffectContext:
     def since_start(
         cls, t: FloatArray, others: Mapping[str, FloatArray] | None = None, start: float | None = None
     ) -> "EffectContext":
-        """Return the context for stamps `t`, shape (N,), seconds, counted from the first one."""
-        return cls(t - t[0] if t.size and t[0] else t, others or {}, start=start)
+        """Return the context for stamps `t`, shape (N,), seconds, counted from the first one if that is above 0."""
+        return cls(t - t[0] if t.size and t[0] > 0.0 else t, others or {}, start=start)
 
     def driven(self, voltage: FloatArray) -> "EffectContext":
         """Return the context with the voltage at the piezo, shape (N,), volts."""
@@ -561,7 +564,7 @@ def usual_step(t: FloatArray) -> float:
 
 def longest(around: EffectContext) -> float:
     """Return the duration (s) of the longest record."""
-    return max(float(t[-1] - t[0]) for t in around.split(around.t))
+    return max(float(t[-1] - max(t[0], 0.0)) for t in around.split(around.t))
 
 
 def decays(time_constants: Sequence[float], around: EffectContext) -> FloatArray:

@@ -113,6 +113,9 @@ class Record:
     surroundings : mapping of str to (ndarray, ndarray), shape (n,) each
         Quantities that were recorded beside it, by topic, or ``topic:field`` where a message has several: times (s)
         from the first stamp, ascending, and values, NaN where there is none. Default none.
+    before : tuple of Record
+        Records of the same session before it, in time order: between and after them nothing else has moved the stage,
+        which rested at their last voltages. A diagnosis knows from them what the stage still remembers. Default none.
 
     Raises
     ------
@@ -127,6 +130,7 @@ class Record:
     hardware_id: str = ""
     notes: tuple[str, ...] = ()
     surroundings: Mapping[str, Course] = field(default_factory=dict)
+    before: "tuple[Record, ...]" = ()
     axes: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:
@@ -167,14 +171,19 @@ class Record:
         return {}
 
     def part(self, rows: slice) -> "Record":
-        """Return the record of some samples."""
+        """Return the record of some samples; in a session those before them go into what was `before`."""
         voltage, displacement = (
             {axis: signal[rows] for axis, signal in signals.items()} for signals in (self.voltage, self.displacement)
         )
         time_ns = self.time_ns[rows]
         later = (time_ns[0] - self.time_ns[0]) * 1e-9 if time_ns.size else 0.0
         beside = {name: (t - later, value) for name, (t, value) in self.surroundings.items()}
-        return replace(self, time_ns=time_ns, voltage=voltage, displacement=displacement, surroundings=beside)
+        before = self.before
+        if before and later:
+            before = (*before, replace(self, before=()).part(slice(0, rows.start)))
+        return replace(
+            self, time_ns=time_ns, voltage=voltage, displacement=displacement, surroundings=beside, before=before
+        )
 
     def __len__(self) -> int:
         return int(self.time_ns.size)

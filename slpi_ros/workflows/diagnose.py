@@ -12,6 +12,7 @@ from slpi_ros.workflows.records import (
     Findings,
     Source,
     fitted_record,
+    in_session,
     mismatch_in_data,
     require_causes,
     require_for_model,
@@ -28,6 +29,7 @@ class DiagnoseRequest:
     source: Source
     model: StageModel
     model_file: str | None = None  # the bags of the fit may be named by their place beside it
+    session: bool = False  # the records are of one session, see `in_session`
 
 
 @dataclass(frozen=True)
@@ -43,6 +45,8 @@ def diagnose(request: DiagnoseRequest) -> DiagnoseOutcome:
     """Find the causes of the errors of a model."""
     source = request.source
     records = source.read(coupled=True, stage=request.model.hardware_id)
+    if request.session:
+        records = in_session(records)
     model = with_given_names(request.model, records, source, request.model_file)
     with mismatch_in_data():
         source = replace(source, axes=shared_axes(records, model, source))

@@ -9,6 +9,8 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from slpi_ros.diagnosis.prepare import no_cause, uncovered
 from slpi_ros.errors import IdentificationError, ModelError, RecordError, SlpiError, UsageError
 from slpi_ros.identification.held_readings import from_fresh
@@ -26,6 +28,8 @@ from slpi_ros.model.axis_model import FitQuality, FittedRecord
 from slpi_ros.model.sensor import IDEAL, Sensor, corrected
 from slpi_ros.model.stage_model import StageModel
 
+# In a session a record begins at the voltage at which the one before it ended, within this share of their range.
+MEETS = 0.01
 # Findings on a record by axis.
 Findings = Mapping[str, Sequence[Finding]]
 
@@ -106,6 +110,38 @@ class Source:
     def for_model(self, model: StageModel) -> "Source":
         """Return the source with the quantities that a model follows, if any, unless others are named."""
         return self if self.surroundings is not None or model.quantities else replace(self, surroundings=())
+
+
+def in_session(records: Sequence[Record]) -> tuple[Record, ...]:
+    """Return records of one session, in which nothing else has moved the stage, each with those before it.
+
+    UsageError if they overlap in time, or one begins at another voltage than that at which the one before it ended.
+    """
+    ordered = sorted(records, key=lambda record: int(record.time_ns[0]))
+    found: list[Record] = []
+    for record in ordered:
+        if found:
+            _require_follows(record, found[-1])
+        found.append(replace(record, before=tuple(ordered[: len(found)])))
+    return tuple(found)
+
+
+def _require_follows(record: Record, earlier: Record) -> None:
+    pair = f"{earlier.source} and {record.source}"
+    if int(record.time_ns[0]) <= int(earlier.time_ns.max()):
+        raise UsageError(f"{pair} overlap in time: they are of no one session; leave out --session")
+    for axis in record.axes:
+        if axis not in earlier.axes:
+            raise UsageError(f"{earlier.source}: no axis '{axis}', which {record.source} has: leave out --session")
+        then, now = (v[np.isfinite(v)] for v in (earlier.voltage[axis], record.voltage[axis]))
+        if not (then.size and now.size):
+            continue
+        low, high = min(then.min(), now.min()), max(then.max(), now.max())
+        if abs(now[0] - then[-1]) > MEETS * (high - low):
+            raise UsageError(
+                f"axis '{axis}': {earlier.source} ends at {then[-1]:.4g} V, {record.source} begins at {now[0]:.4g} V: "
+                "something has moved the stage between them; leave out --session"
+            )
 
 
 def fitted_record(record: Record, axis: str) -> FittedRecord:

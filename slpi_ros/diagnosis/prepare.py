@@ -264,31 +264,33 @@ def _readings(
     v, y, fitted, mixed = samples.v[chosen], samples.y[chosen], samples.fitted[chosen], samples.mixed * chosen.size
     samples = replace(samples, v=v, y=y, fitted=fitted, mixed=mixed // samples.v.size)
     t, others = t[chosen], {name: y[chosen] for name, y in others.items()}
-    for earlier in reversed(record.before):
-        t, samples, others = _after(earlier, record, axis, (t, samples, others))
-    return t, samples, others
+    return _after_session(record, axis, t, samples, others) if record.before else (t, samples, others)
 
 
-def _after(
-    earlier: Record, record: Record, axis: str, readings: tuple[FloatArray, Samples, dict[str, FloatArray]]
+def _after_session(
+    record: Record, axis: str, t: FloatArray, samples: Samples, others: Mapping[str, FloatArray]
 ) -> tuple[FloatArray, Samples, dict[str, FloatArray]]:
-    """Return readings of a record preceded by the voltages of an earlier record, which are not fitted."""
-    t, samples, others = readings
-    at = (earlier.time_ns - record.time_ns[0]) * 1e-9
+    """Return readings preceded by the voltages that the records before have applied, which are not fitted."""
+    at = (np.concatenate([each.time_ns for each in record.before]) - record.time_ns[0]) * 1e-9
+    v = np.concatenate([each.voltage[axis] for each in record.before])
     latest = np.maximum.accumulate(np.insert(at[:-1], 0, -np.inf))
-    driven = np.isfinite(earlier.voltage[axis]) & (at > latest) & (at < t[0])
+    driven = np.flatnonzero(np.isfinite(v) & (at > latest) & (at < t[0]))
+    nothing = np.zeros(driven.size)
+    before = Samples(without_noise(at[driven], v[driven]), nothing, nothing > 0.0)
+    # The reversals, and what slow effects remember: no more samples than the record itself has.
+    kept = before.thinning(samples.v.size)
+    driven, before = driven[kept], before.at(kept)
     moved = {}
     for name, y in others.items():
-        read, first = earlier.displacement[name], record.displacement[name]
+        read, first = np.concatenate([each.displacement[name] for each in record.before]), record.displacement[name]
         known = np.isfinite(read)
-        before = np.interp(at, at[known], read[known] - first[np.isfinite(first)][0]) if known.any() else 0.0 * at
-        moved[name] = np.concatenate([before[driven], y])
-    nothing = np.zeros(np.count_nonzero(driven))
+        way = np.interp(at[driven], at[known], read[known] - first[np.isfinite(first)][0]) if known.any() else before.y
+        moved[name] = np.concatenate([way, y])
     samples = replace(
         samples,
-        v=np.concatenate([without_noise(at[driven], earlier.voltage[axis][driven]), samples.v]),
-        y=np.concatenate([nothing, samples.y]),
-        fitted=np.concatenate([nothing > 0.0, samples.fitted]),
+        v=np.concatenate([before.v, samples.v]),
+        y=np.concatenate([before.y, samples.y]),
+        fitted=np.concatenate([before.fitted, samples.fitted]),
     )
     return np.concatenate([at[driven], t]), samples, moved
 

@@ -76,7 +76,12 @@ def test_a_session_gives_the_voltages_before_a_record_and_no_reading(records):
     assert np.allclose(after.v[own], alone.v, rtol=0.0, atol=1e-9)
     assert np.array_equal(after.y[own], alone.y)
     assert not after.used[~own].any() and not after.seen[~own].any()
-    assert np.array_equal(after.v[~own], records[0].voltage["x"])
+    # Fewer samples of them do, as long as they hold the reversals.
+    before, v = (records[0].time_ns - records[1].time_ns[0]) * 1e-9, records[0].voltage["x"]
+    assert np.count_nonzero(~own) < v.size
+    turns = np.flatnonzero(np.diff(np.sign(np.diff(v)))) + 1
+    assert np.isin(v[turns], after.v[~own]).all()
+    assert np.std(np.interp(before, after.t[~own], after.v[~own]) - v) < 0.01 * np.ptp(v)
     assert after.t[~own][-1] == pytest.approx(-PAUSE)
     assert np.all(np.diff(after.t) > 0.0)
 

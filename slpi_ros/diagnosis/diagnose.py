@@ -312,7 +312,10 @@ def _repeatability(now: JointFit) -> Repeatability:
 def _run(model: AxisModel, part: Part, *, of_record: bool) -> FreeRun:
     model = model.surrounded({key: (part.t, value) for key, value in part.surroundings.items()})
     known, starts = _known(part), likely_starts(model, float(part.v[0]), part.history)
-    return free_run(model, part.t, part.v, part.y, part.used, known, starts, others=part.others, of_record=of_record)
+    y, before = part.y, EffectContext(part.t, before=part.before).without(model.effects).before
+    if before:
+        y = y - sum(effect.remembered(before, part.t) for effect in model.effects)
+    return free_run(model, part.t, part.v, y, part.used, known, starts, others=part.others, of_record=of_record)
 
 
 def _known(part: Part) -> Mask:

@@ -356,7 +356,7 @@ class JointFit:
         self.t, self.y, self.used = evidence.t, evidence.y, evidence.used
         applied, self.u, self._aside = Chain.of(self.effects).reaching(evidence.v, evidence.around)
         # Context passed to the effects.
-        self.around = evidence.around.driven(applied)
+        self.around = evidence.around.without(self.effects).driven(applied)
         if like and not evidence.poses_as(like.evidence):
             like = None
         if like and np.array_equal(like.u, self.u):
@@ -450,7 +450,7 @@ class JointFit:
         """Return the prediction, shape (N,), metres, of the same hysteresis with other effects."""
         applied, u, beside = Chain.of(tuple(effects)).reaching(self.evidence.v, self.evidence.around)
         h = self.h if np.array_equal(u, self.u) else self.respond(u)
-        return self.settling + _behind(effects, h + beside, self.evidence.around.driven(applied))
+        return self.settling + _behind(effects, h + beside, self.evidence.around.without(effects).driven(applied))
 
     def prediction_without(self, name: str) -> FloatArray:
         """Return the prediction, shape (N,), metres, without one of the effects and with everything else unchanged."""

@@ -13,15 +13,16 @@ from slpi_ros.effects.filters import Uniform
 from slpi_ros.errors import RecordError
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
+from slpi_ros.hysteresis.reversals import reversals
 from slpi_ros.identification.bases import Basis, SurfaceBasis
 from slpi_ros.identification.drive import Runs
-from slpi_ros.identification.free_run import choose_start
+from slpi_ros.identification.free_run import InitialState, choose_start
 from slpi_ros.identification.least_squares import FIRST_SMOOTHNESS, Problem, solve_free, walk_of
 from slpi_ros.identification.linear_kinds import SELECTION_SAMPLES, SMOOTHNESS
 from slpi_ros.identification.published_kinds import voltage_dead_band
 from slpi_ros.identification.refit import basis_of
 from slpi_ros.identification.samples import Samples, select_samples
-from slpi_ros.identification.signal_statistics import digit, without_noise
+from slpi_ros.identification.signal_statistics import digit
 from slpi_ros.io.record import Course, Record
 from slpi_ros.io.surroundings import clean, smoothed
 from slpi_ros.model.axis_model import AxisModel
@@ -66,7 +67,7 @@ class Part:
     """Data of one axis from one record, signals and masks of shape (N,)."""
 
     source: str
-    t: FloatArray  # s, from the first stamp; before it below 0
+    t: FloatArray  # s, from the first stamp
     v: FloatArray  # V, as commanded or read
     y: FloatArray  # m
     used: Mask  # in the fit; outliers, drop-outs and an unknown start only drive the hysteresis
@@ -78,6 +79,7 @@ class Part:
     surroundings: Mapping[str, FloatArray] = field(default_factory=dict)  # recorded quantities, in their units
     courses: Mapping[str, Course] = field(default_factory=dict)  # their readings
     mixed: float = 0.0  # share of readings, not used, that are early, late or a mixture of two
+    before: Course | None = None  # times (s, below 0) and displacements (m) of its session, None: unknown
 
 
 @dataclass(frozen=True)
@@ -148,7 +150,13 @@ class Evidence:
             self.t,
             others=self.others,
             records=tuple(
-                EffectContext(part.t, others=part.others, grid=Uniform.over(part.t), surroundings=part.surroundings)
+                EffectContext(
+                    part.t,
+                    others=part.others,
+                    grid=Uniform.over(part.t),
+                    surroundings=part.surroundings,
+                    before=part.before,
+                )
                 for part in self.parts
             ),
             surroundings=self.surroundings,
@@ -218,7 +226,10 @@ def evidence_of(
     basis = _basis(model, [samples for _, samples, _ in read])
     most = SELECTION_SAMPLES // (2 * len(read))
     thin = [samples.thinned(most) for _, samples, _ in read]
-    beginnings = [choose_start(samples, lambda candidate: Problem.pose([candidate], basis)) for samples in thin]
+    beginnings = [
+        _known_start(record, axis, samples) or choose_start(samples, lambda candidate: Problem.pose([candidate], basis))
+        for record, samples in zip(records, thin, strict=True)
+    ]
     started = [beginning.of(samples) for beginning, samples in zip(beginnings, thin, strict=True)]
     parts = tuple(
         Part(
@@ -234,6 +245,7 @@ def evidence_of(
             digit=digit(samples.y[samples.fitted]),
             surroundings=(beside := _at_stamps(record, t)),
             courses={key: record.surroundings[key] for key in beside},
+            before=_before(record, axis, t.size),
         )
         for record, (t, samples, others), beginning in zip(records, read, beginnings, strict=True)
     )
@@ -263,36 +275,45 @@ def _readings(
     chosen = np.flatnonzero(kept)[:MOST_SAMPLES]
     v, y, fitted, mixed = samples.v[chosen], samples.y[chosen], samples.fitted[chosen], samples.mixed * chosen.size
     samples = replace(samples, v=v, y=y, fitted=fitted, mixed=mixed // samples.v.size)
-    t, others = t[chosen], {name: y[chosen] for name, y in others.items()}
-    return _after_session(record, axis, t, samples, others) if record.before else (t, samples, others)
+    return t[chosen], samples, {name: y[chosen] for name, y in others.items()}
 
 
-def _after_session(
-    record: Record, axis: str, t: FloatArray, samples: Samples, others: Mapping[str, FloatArray]
-) -> tuple[FloatArray, Samples, dict[str, FloatArray]]:
-    """Return readings preceded by the voltages that the records before have applied, which are not fitted."""
-    at = (np.concatenate([each.time_ns for each in record.before]) - record.time_ns[0]) * 1e-9
-    v = np.concatenate([each.voltage[axis] for each in record.before])
+def _known_start(record: Record, axis: str, samples: Samples) -> InitialState | None:
+    """Return the initial state after the session before a record; None if that has not erased what was before it."""
+    voltages = [each.voltage[axis] for each in record.before if axis in each.axes]
+    v = np.concatenate([*(each[np.isfinite(each)] for each in voltages), samples.v[:1]])
+    v = np.clip(v, samples.v.min(), samples.v.max())
+    nothing = np.zeros(v.size + samples.v.size)
+    if not Samples(np.append(v, samples.v), nothing, nothing > 0.0).after_reset[v.size]:
+        return None
+    return InitialState(tuple(surviving(v[reversals(v, _dead_band(v))])), only_after_reset=False)
+
+
+def surviving(turns: FloatArray) -> list[float]:
+    """Return the reversals (V) that a path from reversal to reversal, shape (N,), has not wiped out, oldest first."""
+    left: list[float] = []
+    for turn in turns.tolist():
+        while len(left) > 1 and (turn - left[-2]) * (left[-2] - left[-1]) >= 0.0:
+            del left[-2:]
+        if turn not in left[-1:]:
+            left.append(turn)
+    return left
+
+
+def _before(record: Record, axis: str, most: int) -> Course | None:
+    """Return at most about `most` displacements (m) of the session before a record, and their times (s); None if none.
+
+    Slow effects remember them.
+    """
+    own = [each for each in record.before if axis in each.axes]
+    if not own:
+        return None
+    at = (np.concatenate([each.time_ns for each in own]) - record.time_ns[0]) * 1e-9
+    y = np.concatenate([each.displacement[axis] for each in own])
     latest = np.maximum.accumulate(np.insert(at[:-1], 0, -np.inf))
-    driven = np.flatnonzero(np.isfinite(v) & (at > latest) & (at < t[0]))
-    nothing = np.zeros(driven.size)
-    before = Samples(without_noise(at[driven], v[driven]), nothing, nothing > 0.0)
-    # The reversals, and what slow effects remember: no more samples than the record itself has.
-    kept = before.thinning(samples.v.size)
-    driven, before = driven[kept], before.at(kept)
-    moved = {}
-    for name, y in others.items():
-        read, first = np.concatenate([each.displacement[name] for each in record.before]), record.displacement[name]
-        known = np.isfinite(read)
-        way = np.interp(at[driven], at[known], read[known] - first[np.isfinite(first)][0]) if known.any() else before.y
-        moved[name] = np.concatenate([way, y])
-    samples = replace(
-        samples,
-        v=np.concatenate([before.v, samples.v]),
-        y=np.concatenate([before.y, samples.y]),
-        fitted=np.concatenate([before.fitted, samples.fitted]),
-    )
-    return np.concatenate([at[driven], t]), samples, moved
+    known = np.flatnonzero(np.isfinite(y) & (at > latest) & (at < 0.0))
+    known = known[:: -(-known.size // most)] if known.size else known
+    return (at[known], y[known]) if known.size > 1 else None
 
 
 def no_cause(record: Record, course: Course, begins: float, ends: float) -> str:
@@ -339,7 +360,7 @@ def _at_stamps(record: Record, t: FloatArray) -> dict[str, FloatArray]:
     found = {}
     for key, course in record.surroundings.items():
         at, value = clean(course)
-        if few(at) or uncovered(at, max(float(t[0]), 0.0), float(t[-1])):
+        if few(at) or uncovered(at, float(t[0]), float(t[-1])):
             continue
         if reason := of_stage(record, (at, value)):
             warnings.warn(f"{record.source}: {key} is not used: {reason}", stacklevel=2)
@@ -424,8 +445,7 @@ def _require_enough(read: Sequence[tuple[FloatArray, Samples, dict[str, FloatArr
         raise RecordError(
             f"{count} usable samples are too few to leave some out and judge by them; record {FEWEST_SAMPLES} or more"
         )
-    driven = [(t[t >= 0.0], samples.v[t >= 0.0]) for t, samples, _ in read]
-    turns = sum(Runs.of(t, v, _dead_band(v)).turns for t, v in driven)
+    turns = sum(Runs.of(t, samples.v, _dead_band(samples.v)).turns for t, samples, _ in read)
     if turns < FEWEST_TURNS:
         raise RecordError(
             f"the voltage turns {turns} times: one loop only, and nothing to judge it by; record several loops of "
@@ -462,8 +482,7 @@ def one_speed(evidence: Evidence) -> bool:
 
 def drive_frequency(evidence: Evidence) -> float:
     """Return the single drive frequency (Hz) of all records; 0 if there are several."""
-    own = [(part.t, part.v, part.t >= 0.0) for part in evidence.parts]
-    found = [frequency_of_moves(t[rows], v[rows]) for t, v, rows in own]
+    found = [frequency_of_moves(part.t, part.v) for part in evidence.parts]
     return float(np.median(found)) if max(found) < ALMOST * min(found) else 0.0
 
 
@@ -480,7 +499,7 @@ def excited_frequency(evidence: Evidence) -> float:
     """Return the highest frequency (Hz) that any record excites; see `EXCITED`."""
     found = []
     for part in evidence.parts:
-        grid = np.arange(max(part.t[0], 0.0), part.t[-1], usual_step(part.t))
+        grid = np.arange(part.t[0], part.t[-1], usual_step(part.t))
         rate = np.diff(np.interp(grid, part.t, part.v))
         power = np.cumsum(np.abs(np.fft.rfft(rate * np.hanning(rate.size))) ** 2)
         found.append(np.fft.rfftfreq(rate.size, usual_step(part.t))[np.searchsorted(power, EXCITED * power[-1])])

@@ -42,10 +42,7 @@ LINE_WIDTH = 12
 
 @dataclass(frozen=True)
 class EffectContext:
-    """Time (s) from the first stamp, non-decreasing, and signals other than the input that an effect may depend on.
-
-    Times below 0 are those before the record, of which only the voltages are known.
-    """
+    """Time (s) from the first stamp, non-decreasing, and signals other than the input that an effect may depend on."""
 
     t: FloatArray
     # Displacement (m) of the other axes relative to their start, before coupling.
@@ -59,18 +56,28 @@ class EffectContext:
     voltage: FloatArray | None = None
     # Recorded quantities by name, shape (N,), in their units.
     surroundings: Mapping[str, FloatArray] = field(default_factory=dict)
+    # Times (s, below 0) and displacements (m) of the session before the first stamp, as read, or `without` effects;
+    # None: unknown.
+    before: Course | None = None
 
     @classmethod
     def since_start(
         cls, t: FloatArray, others: Mapping[str, FloatArray] | None = None, start: float | None = None
     ) -> "EffectContext":
-        """Return the context for stamps `t`, shape (N,), seconds, counted from the first one if that is above 0."""
-        return cls(t - t[0] if t.size and t[0] > 0.0 else t, others or {}, start=start)
+        """Return the context for stamps `t`, shape (N,), seconds, counted from the first one."""
+        return cls(t - t[0] if t.size and t[0] else t, others or {}, start=start)
 
     def driven(self, voltage: FloatArray) -> "EffectContext":
         """Return the context with the voltage at the piezo, shape (N,), volts."""
         parts = zip(self.records, self.split(voltage), strict=False)
         return replace(self, voltage=voltage, records=tuple(record.driven(part) for record, part in parts))
+
+    def without(self, effects: "Sequence[Effect]") -> "EffectContext":
+        """Return the context with the displacements `before` it without what effects have added."""
+        before = self.before
+        for effect in effects:
+            before = before and effect.hysteresis_before(before)
+        return replace(self, before=before, records=tuple(record.without(effects) for record in self.records))
 
     @property
     def uniform(self) -> Uniform:
@@ -299,6 +306,14 @@ class Effect(ABC):
     def joined(self, other: Self) -> Self | None:
         """Return one effect that stands for both; None if an axis has it once, or if it would hold too much."""
         return None
+
+    def remembered(self, before: Course, t: FloatArray) -> FloatArray:
+        """Return what goes on (m, (N,)) at times `t` (s) from what the hysteresis did `before` a record (m)."""
+        return np.zeros_like(t)
+
+    def hysteresis_before(self, before: Course) -> Course:
+        """Return displacements of a session without what the effect has added to them, if it is remembered."""
+        return before
 
     def starting(self, around: EffectContext, used: Mask) -> FloatArray:
         """Return what is left (m, (N, k)) of its state before each record."""
@@ -564,7 +579,7 @@ def usual_step(t: FloatArray) -> float:
 
 def longest(around: EffectContext) -> float:
     """Return the duration (s) of the longest record."""
-    return max(float(t[-1] - max(t[0], 0.0)) for t in around.split(around.t))
+    return max(float(t[-1] - t[0]) for t in around.split(around.t))
 
 
 def decays(time_constants: Sequence[float], around: EffectContext) -> FloatArray:

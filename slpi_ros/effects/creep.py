@@ -23,6 +23,7 @@ from slpi_ros.effects.base import (
 from slpi_ros.effects.excitation import DriveLimits, DrivePath, Excitation, remaining, safe_duration
 from slpi_ros.effects.filters import Hold, hold
 from slpi_ros.effects.parameters import Fit, Leaf, parameter, require
+from slpi_ros.io.record import Course
 
 # Shortest time constant (s) of creep; shorter ones are modelled as lag.
 FASTEST = 0.1
@@ -41,6 +42,8 @@ LAW_PER_DECADE, LAW_SAMPLES, LAW_TO, LAW_FEWEST = 2, 3.0, (0.3, 3.0), 4
 # unsure, as few records are longer.
 CHAIN, EDGE, POWERS = 10.0 ** np.arange(-3.0, 5.1, 0.5), 10.0**0.25, (0.1, 0.3, 0.6)
 LEAST_POWER, MOST_POWER, UNSURE_FROM = 0.02, 0.9, 100.0
+# Iterations by which creep is taken out of displacements: each leaves a tenth of it at most.
+PICARD = 3
 # Relaxations with a time constant below this share of the record may have an identifiable state at its start.
 SOON_SETTLED = 0.025
 # Creep from a move before the records is known if all records agree on the move within this share.
@@ -152,7 +155,28 @@ class Creep(Effect):
             known = step if isinf(self.exponent) else step + self.initial
             for tau, gain in self.chain.T.tolist():
                 crept += gain * (known - (step + self.initial) * np.exp(-around.since / tau))
+        if around.before:
+            crept += self.remembered(around.before, around.t)
         return signal + crept
+
+    def hysteresis_before(self, before: Course) -> Course:
+        """Return displacements of a session (m) without the creep since its begin."""
+        at, y = before
+        h, around = y, EffectContext.since_start(at)
+        around = replace(around, grid=around.uniform)
+        for _ in range(PICARD):
+            h = y - (replace(self, origin=inf, initial=0.0).apply(h, around) - h)
+        return at, h
+
+    def remembered(self, before: Course, t: FloatArray) -> FloatArray:
+        """Return the creep that what the hysteresis did before a record leaves, shape (N,), m, at times `t` (s)."""
+        at, h = before
+        left, moves, steps = np.zeros_like(t), np.diff(h), np.diff(at)
+        for tau, gain in self.chain.T.tolist():
+            # Of each move, at a constant speed, this share has not followed at the first stamp.
+            ends = np.exp(at / tau)
+            left -= gain * float(moves @ (np.diff(ends) * tau / steps)) * np.exp(-t / tau)
+        return left
 
     @classmethod
     def fit(cls, context: FitContext) -> Iterator[Candidate]:
@@ -397,12 +421,19 @@ def _power(exponent: float) -> FloatArray:
 def _settling(
     time_constants: Sequence[float] | FloatArray, around: EffectContext, used: Mask, gains: FloatArray | None = None
 ) -> FloatArray:
-    """Return the decay of creep that began before each record, shape (N, k), one column per identifiable relaxation."""
+    """Return the decay of creep that began before each record, shape (N, k), one column per identifiable relaxation.
+
+    Of a record whose session is known there is none.
+    """
     # A law, logarithmic or with the `gains` of a power of time, has a single column, for a move just before the record.
     from scipy.linalg import block_diag
 
-    parts = zip(around.split(around.t), around.split(used), strict=True)
-    return np.asarray(block_diag(*(_settling_of(time_constants, t, own, gains) for t, own in parts)))
+    parts = zip(around.records or (around,), around.split(used), strict=True)
+    each = (
+        np.empty((own.size, 0)) if record.before else _settling_of(time_constants, record.t, own, gains)
+        for record, own in parts
+    )
+    return np.asarray(block_diag(*each))
 
 
 def _settling_of(

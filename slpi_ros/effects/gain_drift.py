@@ -100,8 +100,7 @@ class GainDrift(Effect):
     def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield a straight line, and piecewise linear curves with uniform knots and additional early knots."""
         # Displacement shifts at the same knots are fitted with the gains; their ratio gives the origin.
-        t = context.t - max(float(context.t[0]), 0.0)
-        end = float(t[-1])
+        t, end = context.t - context.t[0], float(context.t[-1] - context.t[0])
         travel = np.cumsum(np.abs(np.diff(context.u, prepend=context.u[0])) * context.used)
         first = float(max(np.interp(2.0 * np.ptp(context.u), travel, t), t[context.used][:FEWEST][-1]))
         curves = [np.array([end])]

@@ -87,8 +87,8 @@ class ThermalDrift(Additive):
     @classmethod
     def fit(cls, context: FitContext) -> Iterator[Candidate]:
         """Yield piecewise linear curves with an increasing number of knots."""
-        for knots in KNOTS if float(context.t[-1]) >= TAKES else ():
-            times = np.linspace(max(context.t[0], 0.0), context.t[-1], knots)
+        for knots in KNOTS if float(np.ptp(context.t)) >= TAKES else ():
+            times = np.linspace(context.t[0], context.t[-1], knots)
             # A constant is part of the displacement at rest.
             hats = np.column_stack([np.interp(context.t, times, row) for row in np.eye(knots)[1:]])
             yield Candidate(hats, partial(cls._through, times))

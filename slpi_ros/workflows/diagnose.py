@@ -45,9 +45,9 @@ def diagnose(request: DiagnoseRequest) -> DiagnoseOutcome:
     """Find the causes of the errors of a model."""
     source = request.source
     records = source.read(coupled=True, stage=request.model.hardware_id)
+    model = with_given_names(request.model, records, source, request.model_file)
     if request.session:
         records = in_session(records)
-    model = with_given_names(request.model, records, source, request.model_file)
     with mismatch_in_data():
         source = replace(source, axes=shared_axes(records, model, source))
         found = require_for_model(records, model, source)

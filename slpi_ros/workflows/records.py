@@ -6,6 +6,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,8 @@ from slpi_ros.diagnosis.prepare import no_cause, uncovered
 from slpi_ros.errors import IdentificationError, ModelError, RecordError, SlpiError, UsageError
 from slpi_ros.identification.held_readings import from_fresh
 from slpi_ros.identification.record_quality import Finding, assess, findings, require_usable
-from slpi_ros.identification.samples import ends_of
+from slpi_ros.identification.samples import FEWEST, ends_of
+from slpi_ros.identification.signal_statistics import noise
 from slpi_ros.io.alignment import SeparateTopics
 from slpi_ros.io.bag_files import locate
 from slpi_ros.io.bag_reader import read_bag, require_different, require_one_stage
@@ -28,8 +30,9 @@ from slpi_ros.model.axis_model import FitQuality, FittedRecord
 from slpi_ros.model.sensor import IDEAL, Sensor, corrected
 from slpi_ros.model.stage_model import StageModel
 
-# In a session a record begins at the voltage at which the one before it ended, within this share of their range.
-MEETS = 0.01
+# In a session a record begins at the voltage at which the one before it ended, within this share of their range and
+# this many times the noise of the voltage.
+MEETS, FAR = 0.01, 6.0
 # Findings on a record by axis.
 Findings = Mapping[str, Sequence[Finding]]
 
@@ -117,30 +120,25 @@ def in_session(records: Sequence[Record]) -> tuple[Record, ...]:
 
     UsageError if they overlap in time, or one begins at another voltage than that at which the one before it ended.
     """
-    ordered = sorted(records, key=lambda record: int(record.time_ns[0]))
-    found: list[Record] = []
-    for record in ordered:
-        if found:
-            _require_follows(record, found[-1])
-        found.append(replace(record, before=tuple(ordered[: len(found)])))
-    return tuple(found)
+    ordered = tuple(sorted(records, key=lambda record: int(record.time_ns[0])))
+    for earlier, record in pairwise(ordered):
+        if int(record.time_ns[0]) <= int(earlier.time_ns.max()):
+            both = f"{earlier.source} and {record.source}"
+            raise UsageError(f"{both} overlap in time: they are not of one session; leave out --session")
+    for axis in ordered[0].axes:
+        _require_meeting([record for record in ordered if axis in record.axes], axis)
+    return tuple(replace(record, before=ordered[:number]) for number, record in enumerate(ordered))
 
 
-def _require_follows(record: Record, earlier: Record) -> None:
-    pair = f"{earlier.source} and {record.source}"
-    if int(record.time_ns[0]) <= int(earlier.time_ns.max()):
-        raise UsageError(f"{pair} overlap in time: they are of no one session; leave out --session")
-    for axis in record.axes:
-        if axis not in earlier.axes:
-            raise UsageError(f"{earlier.source}: no axis '{axis}', which {record.source} has: leave out --session")
-        then, now = (v[np.isfinite(v)] for v in (earlier.voltage[axis], record.voltage[axis]))
-        if not (then.size and now.size):
-            continue
-        low, high = min(then.min(), now.min()), max(then.max(), now.max())
-        if abs(now[0] - then[-1]) > MEETS * (high - low):
+def _require_meeting(records: Sequence[Record], axis: str) -> None:
+    known = [(record.source, record.voltage[axis]) for record in records]
+    ways = [(source, v[np.isfinite(v)]) for source, v in known if np.count_nonzero(np.isfinite(v)) >= FEWEST]
+    span = max((float(v.max()) for _, v in ways), default=0.0) - min((float(v.min()) for _, v in ways), default=0.0)
+    for (earlier, before), (source, v) in pairwise(ways):
+        if abs(v[0] - before[-1]) > MEETS * span + FAR * max(noise(before), noise(v)):
             raise UsageError(
-                f"axis '{axis}': {earlier.source} ends at {then[-1]:.4g} V, {record.source} begins at {now[0]:.4g} V: "
-                "something has moved the stage between them; leave out --session"
+                f"axis '{axis}': {earlier} ends at {before[-1]:.4g} V, {source} begins at {v[0]:.4g} V: the stage has "
+                "been moved between them; leave out --session"
             )
 
 

@@ -22,7 +22,9 @@ def record(name, begin):
         ((0.0, 10.0, 20.0), (True, True, False), []),
         ((0.0, 10.0, 20.0), (True, False, False), ["b"]),
         ((0.0, 10.0, 12.0 + 0.99 * LONGEST_PAUSE), (False, False, False), ["a", "b"]),
-        ((0.0, 10.0, 12.0 + 1.01 * LONGEST_PAUSE), (False, False, False), []),
+        ((0.0, 10.0, 12.0 + 1.01 * LONGEST_PAUSE), (False, False, False), ["a", "b"]),
+        ((0.0, 10.0, 12.0 + 0.99 * LONGEST_PAUSE), (True, True, True), ["a", "b"]),
+        ((0.0, 10.0, 12.0 + 1.01 * LONGEST_PAUSE), (True, True, True), []),
         # A clock that was set back.
         ((20.0, 30.0, 10.0), (False, False, False), []),
     ],

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from slpi_ros.diagnosis.diagnose import diagnose
-from slpi_ros.diagnosis.prepare import drive_frequency, evidence_of
+from slpi_ros.diagnosis.prepare import evidence_of, surviving
+from slpi_ros.effects.base import EffectContext
 from slpi_ros.effects.creep import Creep
 from slpi_ros.errors import UsageError
 from slpi_ros.excitation.drives import excite
@@ -68,35 +69,50 @@ def test_slow_creep_is_right_if_the_records_are_of_one_session(records):
     assert apart.max() > 2.0 * session.max()
 
 
-def test_a_session_gives_the_voltages_before_a_record_and_no_reading(records):
+def test_what_went_before_a_record_is_what_the_whole_path_says(records):
+    """Creep of a path is that of its second part alone, and what the first part leaves."""
+    creep = Creep((0.2, 3.0, 40.0), (0.02, 0.01, 0.03))
+    t = np.arange(0.0, 60.0, 0.01)
+    h = 1e-5 * np.sin(2.0 * np.pi * 0.13 * t) + 4e-6 * (t > 25.0) + 1e-7 * t
+    whole = creep.apply(h, EffectContext.since_start(t))
+    begin = 4000
+    own = creep.apply(h[begin:], EffectContext(t[begin:] - t[begin], before=(t[:begin] - t[begin], h[:begin])))
+    # The last move before the record begins is a hundredth of a second of it.
+    assert np.ptp(own - whole[begin:]) < 2e-3 * np.ptp(whole - h)
+    alone = creep.apply(h[begin:], EffectContext(t[begin:] - t[begin]))
+    assert np.ptp(alone - whole[begin:]) > 0.2 * np.ptp(whole - h)
+    at, back = creep.hysteresis_before((t, whole))
+    assert np.array_equal(at, t)
+    assert np.abs((back - back[0]) - (h - h[0])).max() < 1e-3 * np.ptp(whole - h)
+
+
+def test_the_memory_is_known_after_the_whole_range_was_passed(records):
     model = identify(records[0]).axes["x"]
-    alone, after = (evidence_of([each[1]], "x", model).parts[0] for each in (records, in_session(records)))
-    own = after.t >= 0.0
-    assert np.array_equal(after.t[own], alone.t)
-    assert np.allclose(after.v[own], alone.v, rtol=0.0, atol=1e-9)
-    assert np.array_equal(after.y[own], alone.y)
-    assert not after.used[~own].any() and not after.seen[~own].any()
-    # Fewer samples of them do, as long as they hold the reversals.
-    before, v = (records[0].time_ns - records[1].time_ns[0]) * 1e-9, records[0].voltage["x"]
-    assert np.count_nonzero(~own) < v.size
-    turns = np.flatnonzero(np.diff(np.sign(np.diff(v)))) + 1
-    assert np.isin(v[turns], after.v[~own]).all()
-    assert np.std(np.interp(before, after.t[~own], after.v[~own]) - v) < 0.01 * np.ptp(v)
-    assert after.t[~own][-1] == pytest.approx(-PAUSE)
-    assert np.all(np.diff(after.t) > 0.0)
-
-
-def test_the_speed_of_a_record_is_that_of_its_own(records):
-    t = np.arange(0.0, 20.0, 0.005)
-    slow, fast = (
-        Record(np.round((begin + t) * 1e9).astype(np.int64), {"x": v}, {"x": 1e-7 * v}, name)
-        for begin, v, name in (
-            (0.0, 50.0 * (1.0 - np.cos(2.0 * np.pi * 0.2 * t)), "slow"),
-            (30.0, 50.0 * (1.0 - np.cos(2.0 * np.pi * 2.0 * t)), "fast"),
-        )
+    first, second, third = evidence_of(in_session(records), "x", model).parts
+    assert first.before is None
+    for part in (second, third):
+        assert part.used.all() and part.history == (0.0,)
+        at, y = part.before
+        assert at[-1] < -0.9 * PAUSE and np.all(np.diff(at) > 0.0) and at.size <= 1.01 * part.t.size
+    small = replace(records[1], voltage={"x": 0.3 * records[1].voltage["x"]})
+    unknown, alone = (
+        evidence_of([replace(records[2], before=before)], "x", model).parts[0] for before in ((small,), ())
     )
-    evidence = evidence_of([replace(fast, before=(slow,))], "x", None)
-    assert drive_frequency(evidence) == pytest.approx(2.0, rel=0.05)
+    assert unknown.history == alone.history != (0.0,)
+
+
+@pytest.mark.parametrize(
+    ("turns", "left"),
+    [
+        ([0.0, 100.0, 0.0], [0.0]),
+        ([0.0, 100.0, 20.0, 60.0, 40.0], [0.0, 100.0, 20.0, 60.0, 40.0]),
+        ([0.0, 100.0, 20.0, 60.0, 10.0], [0.0, 100.0, 10.0]),
+        ([50.0, 60.0, 40.0, 80.0], [40.0, 80.0]),
+        ([0.0, 0.0], [0.0]),
+    ],
+)
+def test_a_wider_move_wipes_out_reversals(turns, left):
+    assert surviving(np.array(turns))[-len(left) :] == left
 
 
 def test_a_part_of_a_record_knows_the_rest_of_its_session(records):
@@ -116,8 +132,12 @@ def test_records_of_other_sessions_are_refused(records):
     earlier = replace(second, time_ns=second.time_ns - 10 * 10**9)
     with pytest.raises(UsageError, match="overlap"):
         in_session([first, earlier])
-    with pytest.raises(UsageError, match="no axis 'y'"):
-        in_session([first, replace(second, voltage={"y": second.voltage["x"]}, displacement={"y": second.t})])
+    # The readings of a voltage have noise, and an axis that waits has nothing else.
+    scattered = [
+        replace(each, voltage={"x": 50.0 + 0.02 * np.random.default_rng(k).standard_normal(len(each))})
+        for k, each in enumerate(records)
+    ]
+    assert len(in_session(scattered)) == 3
 
 
 def test_a_session_is_in_the_order_of_its_stamps(records):

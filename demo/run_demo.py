@@ -60,8 +60,13 @@ def wipe(stage: Operator) -> tuple[float, float]:
 
 
 def stage_simulator(seed: int, speed: float, warm_up: float = 0.0) -> AbstractContextManager[object]:
-    """Run a stage with one or two effects that it does not tell, which has been on for `warm_up` (s)."""
+    """Run a stage with one or two effects that it does not tell.
+
+    With `warm_up` (s) it has been on for so long, and was moved over its whole range the day before.
+    """
     given = {"rate": RATE, "noise_rms": NOISE, "speed": speed, "warm_up": warm_up}
+    if warm_up:
+        given["initial_state"] = f"[{V_MIN}, {V_MAX}, {V_MIN}]"
     return executable("stage_simulator", seed=seed, character="hidden", **given)
 
 

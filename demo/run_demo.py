@@ -131,7 +131,8 @@ def compared(seed: int, models: Mapping[str, Path], duration: float, warm_up: fl
 
         def scan(low: float, high: float) -> tuple[FloatArray, FloatArray]:
             margin = MARGIN * (high - low)
-            paths.append(scan_path(low + margin, high - margin, duration=duration, rate=RATE, seed=seed))
+            if not paths:
+                paths.append(scan_path(low + margin, high - margin, duration=duration, rate=RATE, seed=seed))
             return paths[0]
 
         # First that of which the calibrator has told the error: from rest, as then. A stage that has moved creeps less.

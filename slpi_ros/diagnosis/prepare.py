@@ -14,6 +14,7 @@ from slpi_ros.errors import RecordError
 from slpi_ros.hysteresis.loop_family import LoopFamily
 from slpi_ros.hysteresis.prandtl_ishlinskii import PrandtlIshlinskii
 from slpi_ros.hysteresis.reversals import reversals
+from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.identification.bases import Basis, SurfaceBasis
 from slpi_ros.identification.drive import Runs
 from slpi_ros.identification.free_run import InitialState, choose_start
@@ -289,15 +290,12 @@ def _known_start(record: Record, axis: str, samples: Samples) -> InitialState | 
     return InitialState(tuple(surviving(v[reversals(v, _dead_band(v))])), only_after_reset=False)
 
 
-def surviving(turns: FloatArray) -> list[float]:
-    """Return the reversals (V) that a path from reversal to reversal, shape (N,), has not wiped out, oldest first."""
-    left: list[float] = []
-    for turn in turns.tolist():
-        while len(left) > 1 and (turn - left[-2]) * (left[-2] - left[-1]) >= 0.0:
-            del left[-2:]
-        if turn not in left[-1:]:
-            left.append(turn)
-    return left
+def surviving(v: FloatArray) -> list[float]:
+    """Return the reversals (V) that a path of voltages, shape (N,), has not wiped out, oldest first, and its end."""
+    # Which ones are remembered does not depend on the shape of the loops.
+    memory = Memory(PrandtlIshlinskii(np.zeros(1), np.ones(1)), float(v[0]), primed=True)
+    memory.forward_array(v)
+    return [*memory.snapshot().reversals, memory.voltage]
 
 
 def _before(record: Record, axis: str, most: int) -> Course | None:
@@ -312,7 +310,8 @@ def _before(record: Record, axis: str, most: int) -> Course | None:
     y = np.concatenate([each.displacement[axis] for each in own])
     latest = np.maximum.accumulate(np.insert(at[:-1], 0, -np.inf))
     known = np.flatnonzero(np.isfinite(y) & (at > latest) & (at < 0.0))
-    known = known[:: -(-known.size // most)] if known.size else known
+    # The last one stays: what moved last is remembered best.
+    known = known[:: min(-known.size // most, -1)][::-1]
     return (at[known], y[known]) if known.size > 1 else None
 
 

@@ -42,6 +42,12 @@ class MemoryState:
     turn_voltages: tuple[float, ...]
     turn_displacements: tuple[float, ...]
 
+    @property
+    def reversals(self) -> tuple[float, ...]:
+        """Remembered reversals, oldest first, volts, without that from which a primed memory fell."""
+        # It is far outside the voltage range of any stage.
+        return tuple(v for v in self.turn_voltages if abs(v) < FAR / 2)
+
 
 class Memory:
     """Reversal memory of one axis, driven by voltage (`forward`) or by displacement (`inverse`)."""

@@ -19,7 +19,6 @@ from slpi_ros.hysteresis import multi_slope as smpi
 from slpi_ros.hysteresis import slpi_published as slpi
 from slpi_ros.hysteresis.kinds import Hysteresis, PathModel
 from slpi_ros.hysteresis.reversals import require_finite
-from slpi_ros.hysteresis.shapes import FAR
 from slpi_ros.hysteresis.turning_points import Memory
 from slpi_ros.io.record import Course
 from slpi_ros.model.limits import Limits, decaying_turns
@@ -188,8 +187,7 @@ class AxisModel:
         if not state.direction:
             return Start(state.voltage, state.displacement)
         from_rest = start.from_rest or not start.history
-        # A primed memory contains a reversal far outside the voltage range of any stage.
-        turns = tuple(v for v in state.turn_voltages if abs(v) < FAR / 2)
+        turns = state.reversals
         if from_rest:
             turns = ((*start.history, start.voltage)[0], *turns)
         if len(turns) > MOST_TURNS:

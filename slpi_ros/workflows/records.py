@@ -32,7 +32,7 @@ from slpi_ros.model.stage_model import StageModel
 
 # In a session a record begins at the voltage at which the one before it ended, within this share of their range and
 # this many times the noise of the voltage.
-MEETS, FAR = 0.01, 6.0
+MEETS, MEETS_NOISE = 0.01, 6.0
 # Findings on a record by axis.
 Findings = Mapping[str, Sequence[Finding]]
 
@@ -135,7 +135,7 @@ def _require_meeting(records: Sequence[Record], axis: str) -> None:
     ways = [(source, v[np.isfinite(v)]) for source, v in known if np.count_nonzero(np.isfinite(v)) >= FEWEST]
     span = max((float(v.max()) for _, v in ways), default=0.0) - min((float(v.min()) for _, v in ways), default=0.0)
     for (earlier, before), (source, v) in pairwise(ways):
-        if abs(v[0] - before[-1]) > MEETS * span + FAR * max(noise(before), noise(v)):
+        if abs(v[0] - before[-1]) > MEETS * span + MEETS_NOISE * max(noise(before), noise(v)):
             raise UsageError(
                 f"axis '{axis}': {earlier} ends at {before[-1]:.4g} V, {source} begins at {v[0]:.4g} V: the stage has "
                 "been moved between them; leave out --session"

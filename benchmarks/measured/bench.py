@@ -2,8 +2,8 @@
 
     python -m benchmarks.measured.bench [--only TASK ..] [--method NAME ..] [--keep]
 
-Errors are those of a free run, rms in % of the range of the judged part. ``*`` marks the best of a row, ``=`` what lies
-within its own 95 % interval of it. The environment variable SLPI_MEASURED_DATA gives the folder of the tables, as
+Errors are those of a free run, rms in % of the range of the judged part. ``*`` marks the best of a row, ``=`` what
+is not worse than it with 95 % certainty. The environment variable SLPI_MEASURED_DATA gives the folder of the tables, as
 ``python -m benchmarks.measured.fetch`` makes it. ``--keep`` writes the figures to the file of kept figures, task by
 task.
 """
@@ -26,7 +26,7 @@ from typing import Any
 from benchmarks import kept
 from benchmarks.measured.manifest import Manifest, Task, read_manifest
 from benchmarks.measured.methods import METHODS, Method
-from benchmarks.measured.scores import Score, Tables, score
+from benchmarks.measured.scores import Score, Tables, interval, score
 
 SECTION, COMMAND = "measured", "make bench-measured"
 
@@ -41,13 +41,16 @@ def data_folder() -> Path | None:
 
 
 def marks(row: Mapping[str, Mapping[str, Any]]) -> dict[str, str]:
-    """Return ``*`` for the method with the least error of a row, ``=`` for those within their own interval of it."""
+    """Return ``*`` for the method with the least error of a row, ``=`` for those that are not clearly worse (95 %)."""
     scored = {name: cell for name, cell in row.items() if "rms" in cell}
     if not scored:
         return {}
     best = min(scored, key=lambda name: float(scored[name]["rms"]))
-    least = float(scored[best]["rms"])
-    return {name: "*" if name == best else "=" if float(cell["low"]) <= least else "" for name, cell in scored.items()}
+    least = scored[best]["blocks"]
+    return {
+        name: "*" if name == best else "=" if interval(cell["blocks"], least)[0] <= 1.0 else ""
+        for name, cell in scored.items()
+    }
 
 
 def table(rows: Mapping[str, Mapping[str, Mapping[str, Any]]], figure: str) -> list[str]:
@@ -111,6 +114,7 @@ def _rounded(cell: Score | str) -> dict[str, Any]:
     if isinstance(cell, str):
         return {"refused": cell}
     figures = {key: value for key, value in asdict(cell).items() if value not in ("", None)}
+    figures["blocks"] = [float(f"{value:.5g}") for value in cell.blocks]
     return {key: round(value, 4) if isinstance(value, float) else value for key, value in figures.items()}
 
 
@@ -125,13 +129,13 @@ def main() -> int:
     options = parser.parse_args()
     folder = data_folder()
     if folder is None:
-        return 0
+        return 1
     methods = [one for one in METHODS if one.name in (options.method or [one.name])]
     tasks = options.only or [task.name for task in manifest.tasks]
     began = time.perf_counter()
     rows = run(manifest, folder, tasks, methods, options.keep, options.processes)
     for title, figure in (
-        ("rms error without its mean, % of range; * best, = within its own interval of the best", "rms"),
+        ("rms error without its mean, % of range; * best, = not worse than it with 95 % certainty", "rms"),
         ("rms error with its mean, % of range", "absolute"),
         ("rms error of the fitted records without its mean, % of range", "fitted"),
         ("rms error of the voltage of the inverse, % of range", "inverse"),

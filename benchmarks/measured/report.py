@@ -18,6 +18,7 @@ import numpy as np
 from benchmarks import kept
 from benchmarks.measured.bench import SECTION, marks
 from benchmarks.measured.manifest import Manifest, read_manifest
+from benchmarks.measured.scores import interval
 
 ROOT = Path(__file__).resolve().parents[2]
 README, PICTURE = ROOT / "README.md", ROOT / "docs" / "images" / "measured.svg"
@@ -70,12 +71,12 @@ def readme_table(rows: Rows, manifest: Manifest, date: str, command: str) -> str
         lines.append(f"| {name} | {' | '.join(cells)} |")
     count = max(len(row) for row in rows.values())
     said = (
-        f"Rms error without its mean, in % of the range of the data, none of which were fitted; {date}, `{command}`. "
-        f"**Bold**: the least of {count} methods; *as good*: no significant difference to it (95 %); *line*: a "
-        f"straight line. One row for each device whose motion was measured: the one with the middle ratio of *SLPI, "
-        f"causes* to the best other method; of two the worse.\n\n"
-        f"{headline(rows, of_piezos(manifest))} {inverses(rows, of_piezos(manifest))} [All {len(rows)} rows, all "
-        f"methods, with intervals](docs/explanation/measured.md)."
+        f"Rms error without its mean, in % of the range of the data. No parameter was fitted to these data, but they "
+        f"were at hand while the package was developed; {date}, `{command}` with the [fetched "
+        f"records](docs/explanation/measured.md). **Bold**: the least of {count} methods; *as good*: not worse with "
+        f"95 % certainty; *line*: a straight line. One row for each device whose motion was measured: the one with the "
+        f"middle ratio of *SLPI, causes* to the best other method; of two the worse.\n\n"
+        f"{headline(rows, of_piezos(manifest))} [All rows and methods, with intervals](docs/explanation/measured.md)."
     )
     return "\n".join([*lines, "", said])
 
@@ -86,16 +87,18 @@ class Comparison:
 
     ratios: tuple[float, ...]
     absolute: tuple[float, ...]
-    wins: int  # below the other's 95 % interval
-    losses: int  # the other below the 95 % interval of SLPI with causes
+    wins: int  # the ratio is below 1 with 95 % certainty
+    losses: int  # above 1
 
-    def __str__(self) -> str:
-        """Return the figures in words."""
-        return (
-            f"median {np.median(self.ratios):.2f}, worst {max(self.ratios):.2f} (offset included "
-            f"{np.median(self.absolute):.2f} and {max(self.absolute):.2f}); clearly better in {self.wins} rows, "
-            f"clearly worse in {self.losses}"
-        )
+    @property
+    def median(self) -> str:
+        """The median, in brackets with the mean error."""
+        return f"{np.median(self.ratios):.2f} ({np.median(self.absolute):.2f})"
+
+    @property
+    def worst(self) -> str:
+        """The largest ratio, in brackets with the mean error."""
+        return f"{max(self.ratios):.2f} ({max(self.absolute):.2f})"
 
 
 def compared(rows: Rows, others: Sequence[str] = ()) -> Comparison:
@@ -111,45 +114,63 @@ def compared(rows: Rows, others: Sequence[str] = ()) -> Comparison:
         best = min(rivals, key=lambda cell: float(cell["rms"]))
         ratios.append(ours["rms"] / best["rms"])
         absolute.append(ours["absolute"] / min(float(cell["absolute"]) for cell in rivals))
-        wins += ours["rms"] < best["low"]
-        losses += best["rms"] < ours["low"]
+        low, high = interval(ours["blocks"], best["blocks"])
+        wins += high < 1.0
+        losses += low > 1.0
     return Comparison(tuple(ratios), tuple(absolute), wins, losses)
 
 
-def of_piezos(manifest: Manifest) -> list[str]:
-    """Return the labels of the rows of piezos whose motion was measured."""
-    return [
-        f"{task.name}: {part}"
+def of_piezos(manifest: Manifest) -> dict[str, str]:
+    """Return the labels of the rows of piezos whose motion was measured, with the name of the device."""
+    return {
+        f"{task.name}: {part}": part.name.split(",")[0]
         for task in manifest.tasks
         for part in task.judged
         if manifest.sources[manifest.records[part.record].source].piezo
+    }
+
+
+def headline(rows: Rows, piezos: Mapping[str, str]) -> str:
+    """Return a table with the ratios to the best other method of each row, to PI and to SLPI, and what it means."""
+    few = {label: rows[label] for label in piezos}
+    voltages = {name: ratios_of_voltages(few, name) for name in ("the best other method", "PI", "SLPI")}
+    lines = [
+        "| error of *SLPI, causes* over that of | median | worst | clearly better | clearly worse |",
+        "|---|---|---|---|---|",
+        *(
+            f"| {name} | {found.median} | {found.worst} | {found.wins} rows | {found.losses} |"
+            for name, found in (
+                (f"the best other method, all {len(rows)} rows", compared(rows)),
+                (f"the best other method, {len(few)} rows of moving piezos", compared(few)),
+                ("PI, all rows", compared(rows, ["PI"])),
+                ("SLPI, all rows", compared(rows, ["SLPI"])),
+            )
+        ),
+        *(
+            f"| {name}: voltage for the measured displacement, {len(few)} rows | {np.median(ratios):.2f} | "
+            f"{max(ratios):.2f} | | |"
+            for name, ratios in voltages.items()
+        ),
     ]
-
-
-def headline(rows: Rows, piezos: Sequence[str]) -> str:
-    """Return sentences with the ratios to the best other method of each row, to PI and to SLPI."""
-    causes = compared(rows, ["SLPI"])
-    return (
-        f"*SLPI, causes* over the best **other** method, chosen afterwards for each row: in all {len(rows)} rows "
-        f"{compared(rows)} (95 %); in the {len(piezos)} rows of moving piezos "
-        f"{compared({label: rows[label] for label in piezos})}. Over PI, in all rows: {compared(rows, ['PI'])}. The "
-        f"causes make SLPI clearly better in {causes.wins} rows and worse in {causes.losses}, at worst by a factor of "
-        f"{max(causes.ratios):.2f} (offset included {max(causes.absolute):.2f})."
+    devices: dict[str, dict[str, Mapping[str, Mapping[str, Any]]]] = {}
+    for label, device in piezos.items():
+        devices.setdefault(device, {})[label] = rows[label]
+    medians = ", ".join(f"{device} {np.median(compared(own).ratios):.2f}" for device, own in devices.items())
+    return "\n".join(lines) + (
+        f"\n\nBelow 1, *SLPI, causes* is better; in brackets with the mean error. *The best other method* is chosen "
+        f"afterwards, for each row. Clearly: with 95 % certainty (blocks of both errors drawn together). Median of "
+        f"each piezo over the best other method: {medians}."
     )
 
 
-def inverses(rows: Rows, piezos: Sequence[str]) -> str:
-    """Return a sentence with the ratios of the errors of the inverse: to the best other method of each row, to PI."""
-    over_best, over_pi = [], []
-    for row in (rows[label] for label in piezos):
+def ratios_of_voltages(rows: Rows, over: str) -> list[float]:
+    """Return the ratios of the errors of the inverse to those of a method, or of the best that is not SLPI."""
+    found = []
+    for row in rows.values():
         errors = {name: float(cell["inverse"]) for name, cell in row.items() if "inverse" in cell}
-        over_best.append(errors["SLPI, causes"] / min(error for name, error in errors.items() if "SLPI" not in name))
-        over_pi.append(errors["SLPI, causes"] / errors["PI"])
-    return (
-        f"The **voltage** that is computed for the measured displacement of these {len(over_best)} rows is off by "
-        f"{np.median(over_best):.2f} times (median; worst {max(over_best):.2f}) as much as that of the best other "
-        f"method, by {np.median(over_pi):.2f} times (worst {max(over_pi):.2f}) as much as that of PI."
-    )
+        least = min(error for name, error in errors.items() if not name.startswith("SLPI"))
+        found.append(errors["SLPI, causes"] / errors.get(over, least))
+    return found
 
 
 def further(rows: Rows, shown: Iterable[str]) -> str:
@@ -157,9 +178,11 @@ def further(rows: Rows, shown: Iterable[str]) -> str:
     cells = [row["SLPI, causes"] for row in rows.values() if "rms" in row["SLPI, causes"]]
     fit, sample = ([float(cell[key]) for cell in cells] for key in ("fit_seconds", "sample_microseconds"))
     few = np.median(compared({label: rows[label] for label in shown}).ratios)
+    lagging = compared(rows, ["PI, lag"])
     return (
-        f"*SLPI, causes* over PI with a lag, in all rows: {compared(rows, ['PI, lag'])}. In the rows of README the "
-        f"median over the best other method is {few:.2f}. A fit of *SLPI, causes* takes {np.median(fit):.0f} s on one "
+        f"*SLPI, causes* over PI with a lag, in all rows: median {lagging.median}, worst {lagging.worst}; clearly "
+        f"better in {lagging.wins} rows, clearly worse in {lagging.losses}. In the rows of README the median over the "
+        f"best other method is {few:.2f}. A fit of *SLPI, causes* takes {np.median(fit):.0f} s on one "
         f"core, the longest {max(fit):.0f} s; the prediction of a sample {np.median(sample):.2f} µs (medians)."
     )
 
@@ -178,14 +201,16 @@ def worse_than_line(rows: Rows, manifest: Manifest) -> list[str]:
     return lines
 
 
-def what_is_judged(manifest: Manifest) -> list[str]:
-    """Return the lines of a table: what each row is, what was fitted, and where the records are from."""
-    lines = ["| row | what is judged | fitted to | records |", "|---|---|---|---|"]
+def what_is_judged(rows: Rows, manifest: Manifest) -> list[str]:
+    """Return the lines of a table: what each row is, what was fitted and found, and where the records are from."""
+    lines = ["| row | what is judged | fitted to | diagnosis | records |", "|---|---|---|---|---|"]
     for task in manifest.tasks:
         source = manifest.sources[manifest.records[task.judged[0].record].source]
         link = f"[{source.repository.split('/')[1]}](https://github.com/{source.repository}/tree/{source.commit})"
         fitted = "; ".join(map(str, task.fitted))
-        lines += [f"| {task.name}: {part} | {part.name} | {fitted} | {link} |" for part in task.judged]
+        for part in task.judged:
+            found = str(rows[label := f"{task.name}: {part}"]["SLPI, causes"].get("said", ""))
+            lines.append(f"| {label} | {part.name} | {fitted} | {found.replace('_', ' ')} | {link} |")
     return lines
 
 
@@ -193,7 +218,7 @@ def full_tables(rows: Rows, manifest: Manifest, date: str, command: str) -> str:
     """Return the tables of the page: every method on every row."""
     names = list(dict.fromkeys(name for row in rows.values() for name in row))
     said = further(rows, by_device(rows, manifest))
-    parts = [f"{date}, `{command}`. {said}", "", "### What is judged", "", *what_is_judged(manifest)]
+    parts = [f"{date}, `{command}`. {said}", "", "### What is judged and found", "", *what_is_judged(rows, manifest)]
     for title, figure, text in (
         ("Without the mean error", "rms", "{0[rms]:.3f} ({0[low]:.3f} to {0[high]:.3f})"),
         ("With the mean error", "absolute", "{0[absolute]:.3f}"),

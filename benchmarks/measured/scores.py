@@ -36,7 +36,7 @@ WARM_UP, STANDS = 0.1, 0.005
 # turn to turn, at least so many samples. Turns of less than a share of the range do not count.
 SMOOTHED, FEWEST, SMALLEST = 0.05, 5, 0.02
 # Blocks of a judged part, draws, and the interval, %: neighbouring errors are alike, blocks nearly independent.
-BLOCKS, DRAWS, INTERVAL = 20, 1000, (2.5, 97.5)
+BLOCKS, DRAWS, INTERVAL = 20, 4000, (2.5, 97.5)
 
 
 @dataclass(frozen=True)
@@ -49,6 +49,8 @@ class Score:
         Free-run error without its mean.
     low, high : float
         95 % interval of `rms`.
+    blocks : tuple of float
+        Mean squares of the error without its mean in `BLOCKS` equal parts of what is judged, %^2.
     absolute : float
         Rms error with its mean.
     fit_seconds, sample_microseconds : float
@@ -65,6 +67,7 @@ class Score:
     rms: float
     low: float
     high: float
+    blocks: tuple[float, ...]
     absolute: float
     fit_seconds: float
     sample_microseconds: float
@@ -103,14 +106,21 @@ def fitted_series(tables: Tables, task: Task) -> list[Series]:
     return [replace(one, history=likely_history(found, one)) for one in found]
 
 
-def interval(error: FloatArray, seed: int = 0) -> tuple[float, float]:
-    """Return the 95 % interval of the rms of errors (N,) by a bootstrap over blocks (Kuensch 1989)."""
-    blocks = np.array_split(error, BLOCKS)
-    squares = np.array([float(np.sum(block**2)) for block in blocks])
-    sizes = np.array([block.size for block in blocks], dtype=np.float64)
-    drawn = np.random.default_rng(seed).integers(BLOCKS, size=(DRAWS, BLOCKS))
-    rms = np.sqrt(squares[drawn].sum(axis=1) / sizes[drawn].sum(axis=1))
-    low, high = np.percentile(rms, INTERVAL)
+def mean_squares(error: FloatArray) -> tuple[float, ...]:
+    """Return the mean squares of equal parts of errors (N,)."""
+    return tuple(float(np.mean(block**2)) for block in np.array_split(error, BLOCKS))
+
+
+def interval(blocks: Sequence[float], others: Sequence[float] | None = None) -> tuple[float, float]:
+    """Return the 95 % interval of an rms error, or of its ratio to another one, by a bootstrap over blocks.
+
+    Errors of two methods on the same samples are alike: blocks are drawn for both together (Kuensch 1989).
+    """
+    drawn = np.random.default_rng(0).integers(BLOCKS, size=(DRAWS, BLOCKS))
+    squares = np.asarray(blocks)[drawn].sum(axis=1) / (
+        BLOCKS if others is None else np.asarray(others)[drawn].sum(axis=1)
+    )
+    low, high = np.percentile(np.sqrt(squares), INTERVAL)
     return float(low), float(high)
 
 
@@ -156,11 +166,13 @@ def _judged(
     error = (run - one.y)[judged]
     share = 100.0 / float(np.ptp(one.y[judged]))
     mean = float(np.mean(error))
-    low, high = interval(share * (error - mean))
+    blocks = mean_squares(share * (error - mean))
+    low, high = interval(blocks)
     return Score(
         rms=share * float(np.std(error)),
         low=low,
         high=high,
+        blocks=blocks,
         absolute=share * float(np.sqrt(np.mean(error**2))),
         fit_seconds=took,
         sample_microseconds=1e6 * seconds / one.t.size,

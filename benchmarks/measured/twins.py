@@ -30,7 +30,7 @@ from benchmarks.measured.bench import data_folder
 from benchmarks.measured.manifest import Task, read_manifest
 from benchmarks.measured.methods import METHODS, Method, Series
 from benchmarks.measured.methods.base import FloatArray, Mask, prepare
-from benchmarks.measured.methods.gru import GruModel
+from benchmarks.measured.methods.gru import GruEnsemble, GruModel
 from benchmarks.measured.methods.linear import Creep, LinearModel, Plays, Preisach, RatePlays
 from benchmarks.measured.methods.narx import NarxModel
 from benchmarks.measured.methods.nonlinear import BoucWen, EnvelopePlays, ModifiedModel
@@ -333,8 +333,8 @@ def twin(folder: Path, task: Task, method: Method) -> list[tuple[str, str, float
                     error = modified(model, records, one, history) - one.y
                 case NarxModel():
                     error = narx(model, records, one, history) - one.y
-                case GruModel():
-                    error = gru(model, one, history) - one.y
+                case GruEnsemble():
+                    error = np.mean([gru(member, one, history) for member in model.members], axis=0) - one.y
                 case LinearModel() if method.name != "PI":
                     error = linear(model, records, one, history, method.name == "PI, lag") - one.y
                 case _:
@@ -354,7 +354,7 @@ def _twin(job: tuple[Path, Task, str]) -> list[tuple[str, str, float, float]]:
 
 
 def main() -> int:
-    """Print the table of methods beside their twins; the exit code is that of a program that ran."""
+    """Print the table of methods beside their twins; the exit code is 1 where there are no records."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--only", nargs="+", metavar="TASK", default=list(TASKS), help="these tasks alone")
     parser.add_argument("--method", nargs="+", metavar="NAME", default=[one.name for one in METHODS])
@@ -362,7 +362,7 @@ def main() -> int:
     options = parser.parse_args()
     folder = data_folder()
     if folder is None:
-        return 0
+        return 1
     chosen = [task for task in read_manifest().tasks if task.name in options.only]
     jobs = [(folder, task, one.name) for task in chosen for one in METHODS if one.name in options.method]
     print(f"{'method':<16}{'row':<46}{'bench':>9}{'twin':>9}{'ratio':>8}")

@@ -2,10 +2,11 @@
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from benchmarks import kept
-from benchmarks.measured import report
+from benchmarks.measured import loop, report, scores
 from benchmarks.measured.bench import SECTION
 from benchmarks.measured.manifest import Manifest, MeasuredRecord, Source, Span, Task, read_manifest
 from benchmarks.measured.methods import METHODS
@@ -105,15 +106,28 @@ def test_picture(tmp_path):
 def test_ratios_to_the_best_other_method():
     def row(ours, pi, other):
         cells = {"SLPI, causes": ours, "SLPI": 0.1, "PI": pi, "GRU": other}
-        return {name: {"rms": x, "low": 0.9 * x, "absolute": 2.0 * x} for name, x in cells.items()}
+        # Blocks that are alike for all methods: each difference is certain.
+        return {name: {"rms": x, "blocks": x**2 * squares, "absolute": 2.0 * x} for name, x in cells.items()}
+
+    squares = np.random.default_rng(0).uniform(0.5, 1.5, scores.BLOCKS)
 
     rows = {"a": row(1.0, 4.0, 2.0), "b": row(1.0, 3.0, 0.95), "c": row(3.0, 1.0, 6.0)}
     best, pi = report.compared(rows), report.compared(rows, ["PI"])
     assert best.ratios == pytest.approx((0.5, 1.0 / 0.95, 3.0))
     assert best.absolute == pytest.approx(best.ratios)
-    assert (best.wins, best.losses) == (1, 1)
+    assert (best.wins, best.losses) == (1, 2)
     assert pi.ratios == pytest.approx((0.25, 1.0 / 3.0, 3.0))
     assert (pi.wins, pi.losses) == (2, 1)
+    # A block that decides alone is no certainty.
+    rows["b"]["GRU"]["blocks"] = np.append(1.2 * squares[:-1], 1.0)
+    assert report.compared(rows).losses == 1
+
+
+def test_the_picture_of_readme_shows_the_best_other_method():
+    rows = section()["figures"]
+    (row,) = (row for label, row in rows.items() if label.startswith(f"{loop.TASK}:"))
+    others = {name: cell["rms"] for name, cell in row.items() if not name.startswith("SLPI") and "rms" in cell}
+    assert min(others, key=others.get) in loop.MODELS
 
 
 def test_what_is_worse_than_a_line_is_explained():

@@ -144,6 +144,10 @@ class Scale:
         """Return V as shares."""
         return (v - self.v_middle) / self.v_half
 
+    def volts(self, u: FloatArray) -> FloatArray:
+        """Return shares as V."""
+        return self.v_middle + self.v_half * u
+
     def displacement(self, y: FloatArray) -> FloatArray:
         """Return displacements as shares."""
         return (y - self.y_mean) / self.y_range
@@ -236,6 +240,12 @@ def delayed(prepared: Prepared, delay: float, lag: float) -> FloatArray:
         return u
     steps = np.diff(t, prepend=t[0])
     return _lagged(u, -np.expm1(-steps / lag))
+
+
+def advanced(t: FloatArray, v: FloatArray, delay: float, lag: float) -> FloatArray:
+    """Return the voltage (N,) that is `v` behind a delay and a first-order lag, s; after the end `v` holds."""
+    led = v + lag * np.gradient(v, t) if lag > 0.0 else v
+    return np.interp(t + delay, t, led)
 
 
 def _lagged(u: FloatArray, shares: FloatArray) -> FloatArray:

@@ -157,16 +157,31 @@ def _inputs(u: FloatArray, speed: float) -> FloatArray:
 
 
 @dataclass(frozen=True)
+class GruEnsemble:
+    """The mean of several networks, which differ in their first weights."""
+
+    members: tuple[GruModel, ...]
+
+    def simulate(self, name: str, t: FloatArray, v: FloatArray, history: tuple[float, ...]) -> FloatArray:
+        """Return the displacement, shape (N,)."""
+        return np.asarray(np.mean([one.simulate(name, t, v, history) for one in self.members], axis=0))
+
+
+@dataclass(frozen=True)
 class GruMethod:
     """The method; the random numbers are the same for every record."""
 
     name: str = "GRU"
     steps: int = STEPS
-    seed: int = 0
+    seeds: tuple[int, ...] = (0, 1, 2)
 
-    def fit(self, records: Sequence[Series]) -> GruModel:
+    def fit(self, records: Sequence[Series]) -> GruEnsemble:
+        """Train a network for each seed."""
+        return GruEnsemble(tuple(self.trained(records, seed) for seed in self.seeds))
+
+    def trained(self, records: Sequence[Series], seed: int) -> GruModel:
         """Train, and keep the weights of the best free run."""
-        rng = np.random.default_rng(self.seed)
+        rng = np.random.default_rng(seed)
         scale = Scale.of(records)
         total = sum(float(one.t[-1] - one.t[0]) for one in records)
         shortest = min(float(np.median(np.diff(one.t))) for one in records)

@@ -14,12 +14,14 @@ from scipy.optimize import minimize_scalar, nnls
 
 from benchmarks.measured.methods import operators
 from benchmarks.measured.methods.base import (
+    BEYOND,
     MOST_ROWS,
     SEARCH_ROWS,
     FloatArray,
     Prepared,
     Scale,
     Series,
+    advanced,
     chosen_history,
     delayed,
     invert_by_iteration,
@@ -171,8 +173,19 @@ class LinearModel:
         return self.scale.back(self.features.columns(prepared, u, rows) @ self.weights + constant)
 
     def invert(self, name: str, t: FloatArray, y: FloatArray, history: tuple[float, ...]) -> FloatArray:
-        """Return the voltage, shape (N,)."""
-        return invert_by_iteration(self, self.scale, name, t, y, history)
+        """Return the voltage, shape (N,): what gives `y` without delay and lag, then delay and lag undone."""
+        still = replace(self, delay=0.0, lag=0.0)
+        if not isinstance(self.features, Plays):
+            v = invert_by_iteration(still, self.scale, name, t, y, history)
+        else:
+            constant = self.constants.get(name, float(np.mean(list(self.constants.values()))))
+            wanted = self.scale.displacement(y) - constant
+            corners = self.scale.voltage(np.asarray(history, dtype=np.float64))
+            # Never moved: all operators rest at the first voltage.
+            first = corners if corners.size else wanted[:1] / np.sum(self.weights)
+            states = operators.plays(first, self.features.radii, np.array([first.size - 1]))[0]
+            v = self.scale.volts(operators.inverse_plays(wanted, self.features.radii, self.weights, states, BEYOND))
+        return advanced(t, v, self.delay, self.lag)
 
 
 def solve(
@@ -219,7 +232,10 @@ def solve(
 def solve_with_ridge(
     columns: FloatArray, y: FloatArray, record: IntArray, free: int, *, largest: bool = False
 ) -> tuple[FloatArray, FloatArray, float]:
-    """Return what `solve` does with the ridge that predicts blocks left out best, or the `largest` as good."""
+    """Return weights and constants as `solve` does, and the mean square error of blocks left out.
+
+    The ridge is the one that predicts blocks left out best, or the `largest` that is as good.
+    """
     errors = np.zeros((len(RIDGES), BLOCKS))
     for block, left_out in enumerate(np.array_split(np.arange(y.size), BLOCKS)):
         kept = np.ones(y.size, dtype=np.bool_)
@@ -235,7 +251,8 @@ def solve_with_ridge(
     if largest:
         limit = mean[chosen] + float(np.std(errors[chosen], ddof=1)) / np.sqrt(BLOCKS)
         chosen = int(np.flatnonzero(mean <= limit)[-1])
-    return solve(columns, y, record, free, RIDGES[chosen])
+    weights, constants, _ = solve(columns, y, record, free, RIDGES[chosen])
+    return weights, constants, float(mean[chosen])
 
 
 @dataclass(frozen=True)
@@ -304,29 +321,33 @@ class LinearMethod:
         Whether delay and lag are fitted.
     search : Features, optional
         Coarser columns for the search of delay and lag. Default: the same.
+    others : tuple of Features, optional
+        Columns that are tried in the place of `features`: those are kept that predict blocks left out best.
     """
 
     features: Features
     name: str
     with_lag: bool = True
     search: Features | None = None
+    others: tuple[Features, ...] = ()
 
     def fit(self, records: Sequence[Series]) -> LinearModel:
         """Search delay, lag and rate parameter, then solve for the weights."""
         coarse = Problem.of(records, SEARCH_ROWS)
         features, delay, lag = self.features, 0.0, 0.0
-        tried = self.search or features
+        rough = self.search or features
         if self.with_lag:
-            delay, lag = search_lag(lambda d, x: coarse.cost(tried, d, x), coarse.period)
+            delay, lag = search_lag(lambda d, x: coarse.cost(rough, d, x), coarse.period)
         if isinstance(features, RatePlays):
             features, delay, lag = _with_rate(features, coarse, delay, lag)
-        if isinstance(features, Creep):
-            features = features.over(coarse.prepared)
-        problem = Problem.of(records, MOST_ROWS)
-        columns = problem.columns(features, delay, lag)
-        weights, constants, _ = solve_with_ridge(
-            columns, problem.y, problem.record, features.free, largest=isinstance(features, Plays | RatePlays)
-        )
+        problem, found = Problem.of(records, MOST_ROWS), []
+        for tried in (features, *self.others):
+            one = tried.over(problem.prepared) if isinstance(tried, Creep) else tried
+            columns = problem.columns(one, delay, lag)
+            largest = isinstance(one, Plays | RatePlays)
+            weights, constants, error = solve_with_ridge(columns, problem.y, problem.record, one.free, largest=largest)
+            found.append((error, one, weights, constants))
+        _, features, weights, constants = min(found, key=lambda each: each[0])
         own = {one.name: float(c) for one, c in zip(records, constants, strict=True)}
         return LinearModel(features, problem.scale, weights, own, delay, lag)
 
@@ -350,6 +371,6 @@ def _with_rate(features: RatePlays, problem: Problem, delay: float, lag: float) 
 LINE = LinearMethod(Line(), "line", with_lag=False)
 PI = LinearMethod(Plays(), "PI", with_lag=False)
 PI_LAG = LinearMethod(Plays(), "PI, lag")
-PI_CREEP = LinearMethod(Creep(), "PI, creep", search=Plays(count=15))
+PI_CREEP = LinearMethod(Creep(), "PI, creep", search=Plays(count=15), others=(Creep(decades=3),))
 PI_RATE = LinearMethod(RatePlays(), "rate-dep. PI", search=Plays(count=15))
-PREISACH = LinearMethod(Preisach(), "Preisach", search=Preisach(8, 4))
+PREISACH = LinearMethod(Preisach(), "Preisach", search=Preisach(8, 4), others=(Preisach(12, 48), Preisach(8, 72)))

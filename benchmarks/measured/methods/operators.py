@@ -39,6 +39,31 @@ def envelope_plays(rising: FloatArray, falling: FloatArray, radii: FloatArray, r
     return out
 
 
+@njit(cache=True)
+def inverse_plays(
+    wanted: FloatArray, radii: FloatArray, weights: FloatArray, states: FloatArray, limit: float
+) -> FloatArray:
+    """Return the input, (N,), with which weighted play operators (K,) give `wanted`, by bisection of each sample.
+
+    `states` (K,) are those before the first sample. The input is kept within -limit..limit.
+    """
+    out, states = np.empty_like(wanted), states.copy()
+    for k in range(wanted.size):
+        low, high = -limit, limit
+        for _ in range(50):
+            middle, total = 0.5 * (low + high), 0.0
+            for i in range(radii.size):
+                total += weights[i] * max(middle - radii[i], min(middle + radii[i], states[i]))
+            if total < wanted[k]:
+                low = middle
+            else:
+                high = middle
+        out[k] = 0.5 * (low + high)
+        for i in range(radii.size):
+            states[i] = max(out[k] - radii[i], min(out[k] + radii[i], states[i]))
+    return out
+
+
 def rate_plays(u: FloatArray, widening: FloatArray, radii: FloatArray, rows: IntArray) -> FloatArray:
     """Return play operators whose radii grow by `widening`, (N,), (R, K)."""
     return envelope_plays(u - widening, u + widening, radii, rows)

@@ -124,7 +124,7 @@ test-properties: build
 	$(PYTEST) -m hypothesis
 
 # The tests of `make test` that take no more than ten seconds and whose outcome may depend on versions: not those of the
-# checkout itself, and of tests with nodes and devices one case each.
+# checkout itself, and one case of each.
 test-jazzy test-newest test-kilted test-minimum:
 	@$(MAKE) --no-print-directory ENVIRONMENT=$(@:test-%=%) test-environment
 

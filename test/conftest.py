@@ -58,7 +58,7 @@ USUAL = os.getpriority(os.PRIO_PROCESS, 0)
 # No verdict depends on the clock. CI draws the same examples every time; `make test-properties` draws more of them.
 CI = bool(os.environ.get("CI"))
 EXAMPLES = int(os.environ.get("SLPI_EXAMPLES", "25"))
-# The other environments differ in versions: of each test with nodes or devices they run the first quick case.
+# The other environments differ in versions: of each test they run the first quick case.
 FIRST_CASES = bool(os.environ.get("SLPI_FIRST_CASES"))
 hypothesis.settings.register_profile("slpi_ros", deadline=None, derandomize=CI, max_examples=EXAMPLES)
 hypothesis.settings.load_profile("slpi_ros")
@@ -86,13 +86,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 def _keep_first_cases(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Deselect all but the first quick case of each test with nodes or devices."""
+    """Deselect all but the first quick case of each test."""
     found, kept, others = set(), [], []
     for item in items:
-        starts = item.get_closest_marker("ros") or item.path.parent.name == "drivers"
         quick = not (item.get_closest_marker("slow") or item.get_closest_marker("long"))
         test = item.nodeid.partition("[")[0]
-        (others if starts and quick and test in found else kept).append(item)
+        (others if quick and test in found else kept).append(item)
         if quick:
             found.add(test)
     config.hook.pytest_deselected(items=others)

@@ -17,17 +17,15 @@ class Driver(Node):
     def __init__(self):
         super().__init__("driver")
         self.device = Device()
-        self.voltage = self.device.applied()  # nothing moves at the start
         self.publisher = self.create_publisher(JointState, "stage_state", 100)
         self.create_subscription(Float64MultiArray, "voltage_command", self.on_command, 100)
         self.create_timer(PERIOD_S, self.publish_state)
 
     def on_command(self, command):
-        self.voltage = min(max(command.data[0], LOWEST_V), HIGHEST_V)
-        self.device.write(self.voltage)
+        self.device.write(min(max(command.data[0], LOWEST_V), HIGHEST_V))
 
     def publish_state(self):
-        state = JointState(name=["x"], effort=[self.voltage])  # volts
+        state = JointState(name=["x"], effort=[self.device.applied()])  # volts that the amplifier puts out
         state.header.stamp = self.get_clock().now().to_msg()  # the time of the measurement, not of the publication
         state.header.frame_id = "stage-17"  # hardware id: the serial number of the stage
         state.position = [self.device.read()]  # metres

@@ -1,4 +1,4 @@
-"""Calibration records of many stages, processed on a Dask cluster, of which ``slpi_ros[fleet]`` installs the parts."""
+"""Calibration records of many stages, processed on a Dask cluster, whose packages ``pip install .[fleet]`` installs."""
 
 from typing import TYPE_CHECKING, Any
 

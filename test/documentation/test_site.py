@@ -7,6 +7,7 @@ import subprocess
 import sys
 from html.parser import HTMLParser
 from importlib import import_module
+from typing import get_args
 from urllib.parse import unquote
 
 import pytest
@@ -16,6 +17,8 @@ pytest.importorskip("rclpy")
 from documentation.pages import DOCS, PAGES, README, ROOT, commands_of  # noqa: E402
 
 from slpi_ros import cli  # noqa: E402
+from slpi_ros.effects.base import Side  # noqa: E402
+from slpi_ros.effects.registry import EFFECTS  # noqa: E402
 
 PATHS = {"PYTHONPATH": os.pathsep.join([str(ROOT), os.environ.get("PYTHONPATH", "")])}
 SHOWN = {"script": "src", "img": "src", "iframe": "src", "source": "src", "link": "href"}
@@ -122,7 +125,12 @@ def test_the_page_of_motions_has_the_table_of_the_code():
 
 
 def test_the_diagnosis_page_has_the_table_of_all_effects():
-    assert "\n<!-- generated: effects -->\n" in (DOCS / "explanation" / "diagnosis.md").read_text()
+    page = (DOCS / "explanation" / "diagnosis.md").read_text()
+    listed = re.search(r"\n<!-- generated: effects -->\n(\*In these files: .+\*)\n", page)
+    assert listed
+    assert re.findall(r"`(\w+)`", listed[1]) == sorted(
+        EFFECTS, key=lambda name: get_args(Side).index(EFFECTS[name].side)
+    )
 
 
 def test_the_values_of_diagnostics_on_the_pages_exist():

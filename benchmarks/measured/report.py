@@ -46,14 +46,14 @@ def by_device(rows: Rows, manifest: Manifest) -> dict[str, str]:
             label = f"{task.name}: {part}"
             names[label] = part.name
             if manifest.sources[source].moves:
-                least = min(float(cell["rms"]) for name, cell in rows[label].items() if _other(name, cell))
+                least = min(float(cell["rms"]) for cell in _others(rows[label]).values())
                 ratios.setdefault(source, []).append((float(rows[label]["SLPI, causes"]["rms"]) / least, label))
     chosen = [sorted(found)[len(found) // 2][1] for found in ratios.values()]
     return {label: names[label] for label in chosen}
 
 
-def _other(name: str, cell: Mapping[str, Any]) -> bool:
-    return not name.startswith("SLPI") and "rms" in cell
+def _others(row: Mapping[str, Mapping[str, Any]]) -> dict[str, Mapping[str, Any]]:
+    return {name: cell for name, cell in row.items() if not name.startswith("SLPI") and "rms" in cell}
 
 
 def readme_table(rows: Rows, manifest: Manifest, date: str, command: str) -> str:
@@ -86,11 +86,10 @@ def lost_with_mean(rows: Rows, manifest: Manifest) -> str:
     """Return a sentence with the rows of README in which only the mean error makes another method the better one."""
     lost = []
     for label, name in by_device(rows, manifest).items():
-        ours, others = rows[label]["SLPI, causes"], {k: v for k, v in rows[label].items() if _other(k, v)}
+        ours, others = rows[label]["SLPI, causes"], _others(rows[label])
         best = min(others, key=lambda other: float(others[other]["absolute"]))
-        if ours["rms"] <= min(float(cell["rms"]) for cell in others.values()) and (
-            ours["absolute"] > others[best]["absolute"]
-        ):
+        wins = ours["rms"] <= min(float(cell["rms"]) for cell in others.values())
+        if wins and ours["absolute"] > others[best]["absolute"]:
             lost.append(f"{name} ({ours['absolute']:.3f}; {best} {others[best]['absolute']:.3f})")
     return f" Lost with the mean error: {'; '.join(lost)}." if lost else ""
 
@@ -120,9 +119,7 @@ def compared(rows: Rows, others: Sequence[str] = ()) -> Comparison:
     ratios, absolute, wins, losses = [], [], 0, 0
     for row in rows.values():
         ours = row["SLPI, causes"]
-        rivals = [
-            cell for name, cell in row.items() if (name in others and "rms" in cell if others else _other(name, cell))
-        ]
+        rivals = [row[name] for name in others if "rms" in row[name]] if others else list(_others(row).values())
         if "rms" not in ours or not rivals:
             continue
         best = min(rivals, key=lambda cell: float(cell["rms"]))
@@ -150,7 +147,7 @@ def headline(rows: Rows, piezos: Mapping[str, str]) -> str:
     extended = {
         label: row for label, row in rows.items() if "in the model: nothing" not in row["SLPI, causes"].get("said", "")
     }
-    voltages = {name: ratios_of_voltages(few, name) for name in ("the best other method", "PI", "SLPI")}
+    voltages = {name or "the best other method": ratios_of_voltages(few, name) for name in (None, "PI", "SLPI")}
     lines = [
         "| error of *SLPI, causes* over that of | median | worst | clearly better | clearly worse |",
         "|---|---|---|---|---|",
@@ -174,25 +171,24 @@ def headline(rows: Rows, piezos: Mapping[str, str]) -> str:
     for label, device in piezos.items():
         devices.setdefault(device, {})[label] = rows[label]
     medians = ", ".join(
-        f"{device} {np.median(compared(own).ratios):.2f} "
-        f"(voltage {np.median(ratios_of_voltages(own, 'the best other method')):.2f})"
+        f"{device} {np.median(compared(own).ratios):.2f} (voltage {np.median(ratios_of_voltages(own)):.2f})"
         for device, own in devices.items()
     )
     return "\n".join(lines) + (
         f"\n\nBelow 1, *SLPI, causes* is better; in brackets with the mean error. *The best other method* is chosen "
         f"afterwards, for each row. Clearly: with 95 % certainty (paired block bootstrap). Medians of each piezo over "
-        f"the best other method: {medians}. The voltages of the PICMA stack leave the fitted range, at which "
-        f"SLPI stops."
+        f"the best other method: {medians}. SLPI keeps to the fitted range of voltages, the others may "
+        f"leave it by a tenth."
     )
 
 
-def ratios_of_voltages(rows: Rows, over: str) -> list[float]:
-    """Return the ratios of the errors of the inverse to those of a method, or of the best that is not SLPI."""
+def ratios_of_voltages(rows: Rows, over: str | None = None) -> list[float]:
+    """Return the ratios of the errors of the inverse to those of a method; default: of the best that is not SLPI."""
     found = []
     for row in rows.values():
         errors = {name: float(cell["inverse"]) for name, cell in row.items() if "inverse" in cell}
-        least = min(error for name, error in errors.items() if not name.startswith("SLPI"))
-        found.append(errors["SLPI, causes"] / errors.get(over, least))
+        other = errors[over] if over else min(x for name, x in errors.items() if not name.startswith("SLPI"))
+        found.append(errors["SLPI, causes"] / other)
     return found
 
 

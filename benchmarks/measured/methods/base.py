@@ -166,7 +166,7 @@ def invert_by_iteration(
     share is halved where the error grows.
     """
     slope, share = scale.y_range / (2.0 * scale.v_half), FIRST_SHARE
-    low, high = scale.v_middle - BEYOND * scale.v_half, scale.v_middle + BEYOND * scale.v_half
+    low, high = scale.volts(np.array([-BEYOND, BEYOND]))
     v = np.clip(scale.v_middle + (y - scale.y_mean) / slope, low, high)
     error = y - model.simulate(name, t, v, history)
     for _ in range(ITERATIONS):

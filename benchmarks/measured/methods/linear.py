@@ -169,8 +169,11 @@ class LinearModel:
         prepared = prepare(t, self.scale.voltage(v), before)
         u = delayed(prepared, self.delay, self.lag)
         rows = np.arange(prepared.skipped, u.size)
-        constant = self.constants.get(name, float(np.mean(list(self.constants.values()))))
-        return self.scale.back(self.features.columns(prepared, u, rows) @ self.weights + constant)
+        return self.scale.back(self.features.columns(prepared, u, rows) @ self.weights + self.constant(name))
+
+    def constant(self, name: str) -> float:
+        """Return the constant of a fitted record, or the mean of all for another one."""
+        return self.constants.get(name, float(np.mean(list(self.constants.values()))))
 
     def invert(self, name: str, t: FloatArray, y: FloatArray, history: tuple[float, ...]) -> FloatArray:
         """Return the voltage, shape (N,): what gives `y` without delay and lag, then delay and lag undone."""
@@ -178,8 +181,7 @@ class LinearModel:
         if not isinstance(self.features, Plays):
             v = invert_by_iteration(still, self.scale, name, t, y, history)
         else:
-            constant = self.constants.get(name, float(np.mean(list(self.constants.values()))))
-            wanted = self.scale.displacement(y) - constant
+            wanted = self.scale.displacement(y) - self.constant(name)
             corners = self.scale.voltage(np.asarray(history, dtype=np.float64))
             # Never moved: all operators rest at the first voltage.
             first = corners if corners.size else wanted[:1] / np.sum(self.weights)

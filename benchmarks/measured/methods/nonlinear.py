@@ -135,13 +135,13 @@ class ModifiedModel:
         scale = self.base.scale
         inner = scale.displacement(self.base.simulate(name, t, v, history))
         # The constant of a record is added behind the function.
-        constant = self.base.constants.get(name, float(np.mean(list(self.base.constants.values()))))
+        constant = self.base.constant(name)
         return scale.back(_bent(inner - constant, self.knots, self.values) + constant)
 
     def invert(self, name: str, t: FloatArray, y: FloatArray, history: tuple[float, ...]) -> FloatArray:
         """Return the voltage, shape (N,): the function undone, then the play operators."""
         scale = self.base.scale
-        constant = self.base.constants.get(name, float(np.mean(list(self.base.constants.values()))))
+        constant = self.base.constant(name)
         inner = _bent(scale.displacement(y) - constant, self.values, self.knots)
         return self.base.invert(name, t, scale.back(inner + constant), history)
 

@@ -23,6 +23,7 @@ NOT_RUN = {
     "slpi identify my_bag": "the same",
     "slpi diagnose my_bag": "the same",
     "slpi verify another_bag": "the same",
+    "slpi compensate diagnosis/extended_model.json": "the same",
     "ros2 run slpi_ros exciter": "run below by hand, with another seed",
     "ros2 bag record /stage_state -o": "rosbag2 has no wheels: the recorder does the same",
 }
